@@ -1,0 +1,1 @@
+"""Training data: procedural shapes, patch files, data module."""
