@@ -1,0 +1,48 @@
+# One line a target: `make help`. Everything runs in $(VENV), which each target sets up by itself.
+PYTHON ?= python3
+VENV   ?= .venv
+ARGS   ?=
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help setup check test train sweep board bench clean
+
+help:   ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@echo 'ARGS="key=value ..." is passed on: make train ARGS="model=pnu_paper loss.w3=0.1"'
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "pnu needs Python 3.11 or newer, $(PYTHON) is " + sys.version.split()[0] + ": make PYTHON=python3.12 ...")'
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo 'Python lacks venv; on Debian: apt-get install python3-venv'; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@$(BIN)/python -m pnu.doctor --install
+	@touch $@
+
+setup: $(STAMP)   ## virtual environment in .venv, pinned packages, pnu itself, system libraries
+
+check: $(STAMP)   ## lint, format and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+test: $(STAMP)   ## the test suite (minutes); ARGS="-m slow" for the slow ones
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto $(ARGS)
+
+train: $(STAMP)   ## train the paper's network on embedded data: a small success in minutes
+	$(BIN)/python -m pnu.train experiment=quickstart $(ARGS)
+
+sweep: $(STAMP)   ## a small sweep of one loss weight over two values
+	$(BIN)/python -m pnu.train -m experiment=quickstart loss.w3=0,0.05 $(ARGS)
+
+board: $(STAMP)   ## TensorBoard over outputs/
+	@$(BIN)/python -m pnu.doctor --require
+	$(BIN)/tensorboard --logdir outputs $(ARGS)
+
+bench: $(STAMP)   ## measure speed, as ratios to named alternatives
+	$(BIN)/python -m bench $(ARGS)
+
+clean:   ## remove caches and the virtual environment; data/ and outputs/ stay
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

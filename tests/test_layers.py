@@ -1,0 +1,109 @@
+"""The house: imports point one way, and `import pnu` stays light."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "pnu"
+
+# From the ground up. A module imports only from layers below its own, or from its own package (pnu.ops, pnu.data, ...).
+LAYERS = [
+    {"pnu.doctor", "pnu.io"},
+    {"pnu.ops"},
+    {"pnu.data"},
+    {"pnu.models", "pnu.losses", "pnu.metrics"},
+    {"pnu.checkpoint"},
+    {"pnu.inference", "pnu.surfaces", "pnu.pictures", "pnu.classical"},
+    {"pnu.evaluation"},
+    {"pnu.run", "pnu.schema"},
+    {"pnu.lit", "pnu.callbacks"},
+]
+HEAVY = {"torch", "lightning", "hydra", "open3d", "tensorboard", "torchmetrics", "scipy", "h5py", "trimesh"}
+
+
+def modules() -> dict[str, Path]:
+    names = {}
+    for path in PACKAGE.rglob("*.py"):
+        parts = ("pnu", *path.relative_to(PACKAGE).with_suffix("").parts)
+        names[".".join(parts).removesuffix(".__init__")] = path
+    return names
+
+
+def is_entry_point(path: Path) -> bool:
+    return '__name__ == "__main__"' in path.read_text()
+
+
+def room(module: str) -> str:
+    return ".".join(module.split(".")[:2])
+
+
+def layer(module: str, path: Path) -> int:
+    for level, rooms in enumerate(LAYERS):
+        if room(module) in rooms:
+            return level
+    assert is_entry_point(path), f"{module} is in no layer and no entry point: give it a place in LAYERS"
+    return len(LAYERS)
+
+
+def imported(path: Path) -> set[str]:
+    """Modules of pnu that a file imports, in functions too; imports for type checkers alone do not count."""
+    tree = ast.parse(path.read_text())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            node.body = []
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return {name for name in found if name.startswith("pnu.")}
+
+
+def violations(names: dict[str, Path]) -> list[str]:
+    found = []
+    for module, path in names.items():
+        if module == "pnu":
+            continue
+        for target in imported(path) & names.keys():
+            if room(target) != room(module) and layer(target, names[target]) >= layer(module, path):
+                found.append(f"{module} imports {target}")
+    return found
+
+
+def test_imports_point_down() -> None:
+    assert violations(modules()) == []
+
+
+def test_upward_import_is_found(tmp_path: Path) -> None:
+    culprit = tmp_path / "io.py"
+    culprit.write_text("def f():\n    from pnu.ops import nearest\n")
+    names = modules() | {"pnu.io": culprit}
+    assert "pnu.io imports pnu.ops" in violations(names)
+
+
+@pytest.mark.parametrize("package", ["lightning", "open3d"])
+def test_heavy_packages_stay_in_their_rooms(package: str) -> None:
+    """lightning is imported at the top only where a class needs it, open3d only inside functions."""
+    rooms = {"lightning": {"pnu.data.datamodule", "pnu.lit", "pnu.callbacks"}, "open3d": set()}[package]
+    for module, path in modules().items():
+        for node in ast.parse(path.read_text()).body:
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert module in rooms or package not in {name.split(".")[0] for name in names}, module
+
+
+def loaded_by(statement: str) -> set[str]:
+    code = f"import sys; {statement}; print(*{{m.split('.')[0] for m in sys.modules}})"
+    return set(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split())
+
+
+def test_import_is_light() -> None:
+    assert not loaded_by("import pnu") & HEAVY
+
+
+def test_heavy_import_would_be_seen() -> None:
+    assert "torch" in loaded_by("import pnu; import pnu.ops.nearest") & HEAVY
