@@ -1,0 +1,165 @@
+"""Neighbour searches between two clouds: trees on the CPU, chunks of bounded memory on other devices."""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+CHUNK_ELEMENTS = 2**25  # distances held at once where no tree is used: 128 MiB in float32
+
+
+class Neighbors(NamedTuple):
+    """Nearest targets of each query, by ascending distance.
+
+    `idx[b, i, j] = t`: target t is the j-th nearest of query i in cloud b, at squared distance `dist_sq[b, i, j]`.
+    """
+
+    dist_sq: Tensor  # (B, m, k), dtype and device of the query
+    idx: Tensor  # (B, m, k) int64
+
+
+def knn(query: Tensor, target: Tensor, k: int) -> Neighbors:
+    """The k nearest targets of each query; a search, so without gradient.
+
+    query (B, m, 3), target (B, n, 3); equal distances come in any order. ValueError if k is not in 1..n.
+    """
+    _check(query, target)
+    if not 1 <= k <= target.shape[1]:
+        raise ValueError(f"k: expected 1 to {target.shape[1]} neighbours (the number of target points), found {k}")
+    query, target = query.detach(), target.detach()
+    if query.device.type == "cpu":
+        return _knn_tree(query, target, k)
+    return _knn_chunks(query, target, k)
+
+
+def nearest(query: Tensor, target: Tensor) -> Neighbors:
+    """The nearest target of each query, as `knn` with k = 1 but of shape (B, m): `idx[b, i] = t`."""
+    found = knn(query, target, 1)
+    return Neighbors(found.dist_sq[..., 0], found.idx[..., 0])
+
+
+def ball_query(query: Tensor, target: Tensor, radius: float, k: int) -> Tensor:
+    """The first k targets, in storage order, that are closer than `radius` to each query (PointNet++).
+
+    query (B, m, 3), target (B, n, 3) -> idx (B, m, k) int64: `idx[b, i, j] = t`, target t is the j-th of those within
+    the radius of query i. Where there are fewer than k the first one is repeated; where there is none, all are 0.
+    """
+    _check(query, target)
+    if k < 1:
+        raise ValueError(f"k: expected at least 1 neighbour, found {k}")
+    if not radius > 0:
+        raise ValueError(f"radius: expected a positive distance, found {radius}")
+    query, target = query.detach(), target.detach()
+    if query.device.type == "cpu":
+        return _ball_tree(query, target, radius, k)
+    return _ball_chunks(query, target, radius, k)
+
+
+def per_cloud(function: Callable[[int], None], clouds: int) -> None:
+    """Call function(0) .. function(clouds - 1), spread over as many threads as torch uses (SciPy frees the GIL)."""
+    threads = min(torch.get_num_threads(), clouds)
+    if threads <= 1:
+        for b in range(clouds):
+            function(b)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(function, range(clouds)))
+
+
+def _check(query: Tensor, target: Tensor) -> None:
+    for name, cloud in (("query", query), ("target", target)):
+        if cloud.ndim != 3 or cloud.shape[2] != 3:
+            raise ValueError(f"{name}: expected points of shape (B, n, 3), found {tuple(cloud.shape)}")
+    if query.shape[0] != target.shape[0]:
+        raise ValueError(
+            f"target: expected {query.shape[0]} clouds, one for each of the query, found {target.shape[0]}"
+        )
+    if target.shape[1] == 0:
+        raise ValueError("target: expected at least one point, found none")
+
+
+def _knn_tree(query: Tensor, target: Tensor, k: int) -> Neighbors:
+    clouds, m, _ = query.shape
+    dist_sq = np.empty((clouds, m, k))
+    idx = np.empty((clouds, m, k), np.int64)
+    workers = 1 if clouds > 1 else torch.get_num_threads()
+
+    def search(b: int) -> None:
+        dist, idx[b] = cKDTree(target[b].double().numpy()).query(
+            query[b].double().numpy(), k=np.arange(1, k + 1), workers=workers
+        )
+        np.multiply(dist, dist, out=dist_sq[b])
+
+    per_cloud(search, clouds)
+    return Neighbors(torch.from_numpy(dist_sq).to(query.dtype), torch.from_numpy(idx))
+
+
+def _ball_tree(query: Tensor, target: Tensor, radius: float, k: int) -> Tensor:
+    clouds, m, _ = query.shape
+    idx = np.zeros((clouds, m, k), np.int64)
+
+    def search(b: int) -> None:
+        tree = cKDTree(query[b].double().numpy())
+        pairs = tree.sparse_distance_matrix(cKDTree(target[b].double().numpy()), radius, output_type="ndarray")
+        pairs = pairs[pairs["v"] < radius]
+        pairs = pairs[np.argsort(pairs["i"] * target.shape[1] + pairs["j"])]
+        row, column = pairs["i"], pairs["j"]
+        count = np.bincount(row, minlength=m)
+        first = np.cumsum(count) - count
+        rank = np.arange(len(row)) - first[row]
+        some = count > 0
+        idx[b, some] = column[first[some], None]
+        kept = rank < k
+        idx[b, row[kept], rank[kept]] = column[kept]
+
+    per_cloud(search, clouds)
+    return torch.from_numpy(idx)
+
+
+def _chunks(query: Tensor, target: Tensor) -> Iterator[tuple[slice, slice]]:
+    """Slices (clouds, queries) whose distances to all targets stay below CHUNK_ELEMENTS."""
+    clouds, m, _ = query.shape
+    rows = max(1, CHUNK_ELEMENTS // target.shape[1])
+    if rows >= m:
+        step = rows // max(m, 1)
+        for b in range(0, clouds, step):
+            yield slice(b, b + step), slice(None)
+        return
+    for b in range(clouds):
+        for i in range(0, m, rows):
+            yield slice(b, b + 1), slice(i, i + rows)
+
+
+def _distances_sq(query: Tensor, target: Tensor) -> Tensor:
+    """(B, m, n) by differences: the faster expansion of the square loses half of the digits."""
+    total = (query[:, :, None, 0] - target[:, None, :, 0]).square_()
+    for axis in (1, 2):
+        total += (query[:, :, None, axis] - target[:, None, :, axis]).square_()
+    return total
+
+
+def _knn_chunks(query: Tensor, target: Tensor, k: int) -> Neighbors:
+    clouds, m, _ = query.shape
+    dist_sq = query.new_empty(clouds, m, k)
+    idx = torch.empty(clouds, m, k, dtype=torch.int64, device=query.device)
+    for b, i in _chunks(query, target):
+        dist_sq[b, i], idx[b, i] = _distances_sq(query[b, i], target[b]).topk(k, dim=-1, largest=False)
+    return Neighbors(dist_sq, idx)
+
+
+def _ball_chunks(query: Tensor, target: Tensor, radius: float, k: int) -> Tensor:
+    clouds, m, _ = query.shape
+    n = target.shape[1]
+    idx = torch.empty(clouds, m, k, dtype=torch.int64, device=query.device)
+    order = torch.arange(n, device=query.device)
+    for b, i in _chunks(query, target):
+        inside = _distances_sq(query[b, i], target[b]).sqrt_() < radius
+        found = torch.where(inside, order, n).topk(min(k, n), dim=-1, largest=False).values
+        first = found[..., :1] % n  # none found: n % n = 0
+        idx[b, i] = first
+        idx[b, i, : found.shape[-1]] = torch.where(found < n, found, first)
+    return idx
