@@ -1,0 +1,97 @@
+"""The entry point of a command."""
+
+import functools
+import os
+import sys
+import typing
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from pnu.run.config import check_keys, composer, config_folder, variations
+from pnu.run.help import help_text
+from pnu.run.schema import check
+
+
+def command(function: Callable[[Any], Any], schema: type, name: str | None = None) -> Callable[..., Any]:
+    """The entry point `main(argv=None)` of a command: `function` called with the config that argv describes.
+
+    Args:
+        function: gets the checked config; its `ValueError`s and `OSError`s become one line and exit code 2.
+        schema: dataclass that documents every key of `conf/<name>.yaml`.
+        name: of the config file; default: the schema's name in lower case.
+    """
+    name = name or schema.__name__.lower()
+
+    @functools.wraps(function)
+    def task(cfg: Any) -> Any:
+        try:
+            return function(check(cfg, schema))
+        except (ValueError, OSError) as error:
+            if full_errors():
+                raise
+            if in_multirun():
+                from hydra.errors import CompactHydraException
+
+                raise CompactHydraException(f"error: {one_line(error)}") from None
+            stop(error)
+
+    def main(argv: Sequence[str] | None = None) -> None:
+        arguments = list(sys.argv[1:] if argv is None else argv)
+        program = f"python -m pnu.{name}" if sys.argv[0].endswith(".py") else Path(sys.argv[0]).name
+        import hydra
+        from hydra._internal.utils import get_args_parser
+
+        parsed = get_args_parser().parse_args(arguments)
+        overrides = [o for o in parsed.overrides if not o.startswith("hydra.")]
+        try:
+            with composer(name, parsed.config_dir) as compose:
+                if parsed.help:
+                    print(help_text(schema, program, check(compose(overrides), schema, complete=False)))
+                    return
+                for one in variations(overrides, parsed.config_dir):
+                    check_keys(one, schema, compose)
+                    if not parsed.cfg:
+                        check(compose(one), schema)
+        except (ValueError, OSError) as error:
+            if full_errors():
+                raise
+            stop(error)
+        start = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=name)(task)
+        with replaced_argv(arguments):
+            start()
+
+    main.schema = schema  # type: ignore[attr-defined]
+    main.__doc__ = schema.__doc__
+    return main
+
+
+def stop(error: Exception) -> typing.NoReturn:
+    print(f"error: {one_line(error)}", file=sys.stderr)
+    sys.exit(2)
+
+
+def one_line(error: BaseException) -> str:
+    """An exception's message on one line."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def full_errors() -> bool:
+    return os.environ.get("HYDRA_FULL_ERROR") == "1"
+
+
+def in_multirun() -> bool:
+    """Whether the code runs as one job of several that a sweeper started."""
+    from hydra.core.hydra_config import HydraConfig
+
+    return HydraConfig.initialized() and str(HydraConfig.get().mode) == "RunMode.MULTIRUN"
+
+
+@contextmanager
+def replaced_argv(arguments: list[str]) -> Iterator[None]:
+    before, sys.argv = sys.argv, [sys.argv[0], *arguments]
+    try:
+        yield
+    finally:
+        sys.argv = before

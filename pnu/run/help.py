@@ -1,0 +1,46 @@
+"""The text of `--help`: every key with its present value and its line of documentation."""
+
+import dataclasses
+import typing
+from typing import Any
+
+from pnu.run.config import config_folder
+from pnu.run.schema import fields
+
+
+def shown(value: Any) -> str:
+    """A value as one types it."""
+    if isinstance(value, float):
+        return f"{value:g}"
+    return (
+        {None: "null", True: "true", False: "false"}.get(value, str(value))
+        if not hasattr(value, "keys")
+        else str(value)
+    )
+
+
+def help_text(schema: type, program: str, cfg: Any) -> str:
+    """What a command does, and for every key its present value and its line of documentation."""
+    from omegaconf import OmegaConf
+
+    lines = []
+
+    def describe(schema: type, cfg: Any, prefix: str) -> None:
+        hints = typing.get_type_hints(schema)
+        for name, field in fields(schema).items():
+            key = f"{prefix}{name}"
+            if name not in list(cfg):  # `in cfg` would leave out those that are still ???
+                continue
+            if dataclasses.is_dataclass(hints[name]):
+                options = sorted(path.stem for path in (config_folder() / key.replace(".", "/")).glob("*.yaml"))
+                choices = f" ({key}={'|'.join(options)})" if options else ""
+                lines.append(f"\n{field.metadata['doc']}{choices}")
+                describe(typing.cast(type, hints[name]), cfg[name] or {}, f"{key}.")
+            else:
+                missing = OmegaConf.is_missing(cfg, name)
+                value = "..." if missing else shown(cfg[name])
+                lines.append(f"  {key + '=' + value:<38} {field.metadata['doc']}")
+
+    describe(schema, cfg, "")
+    usage = f"usage: {program} [key=value ...]      (-m key=a,b: one run for each value)"
+    return "\n".join([usage, "", (schema.__doc__ or "").strip(), "", *lines])
