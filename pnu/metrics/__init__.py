@@ -1,0 +1,67 @@
+"""Distances between upsampled clouds and the truth: plain functions, and torchmetrics classes over them.
+
+The functions need no torchmetrics; the classes are imported on first use, since torchmetrics takes seconds to import.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from pnu.metrics.functional import (
+    NormalErrors,
+    chamfer_sq,
+    compare,
+    compare_mesh,
+    emd_exact,
+    hausdorff,
+    hausdorff_sq,
+    mean_compute,
+    mean_update,
+    normal_error,
+    point_to_mesh,
+    spacing_cv,
+    uniformity,
+)
+
+if TYPE_CHECKING:
+    from pnu.metrics.modules import (
+        ChamferDistance,
+        CloudMetrics,
+        EarthMoverDistance,
+        HausdorffDistance,
+        NormalError,
+        PointToMesh,
+        Spacing,
+        Uniformity,
+    )
+
+__all__ = [
+    "ChamferDistance",
+    "CloudMetrics",
+    "EarthMoverDistance",
+    "HausdorffDistance",
+    "NormalError",
+    "NormalErrors",
+    "PointToMesh",
+    "Spacing",
+    "Uniformity",
+    "chamfer_sq",
+    "compare",
+    "compare_mesh",
+    "emd_exact",
+    "hausdorff",
+    "hausdorff_sq",
+    "mean_compute",
+    "mean_update",
+    "normal_error",
+    "point_to_mesh",
+    "spacing_cv",
+    "uniformity",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the torchmetrics classes on first use."""
+    if name in __all__:
+        from pnu.metrics import modules
+
+        return getattr(modules, name)
+    raise AttributeError(f"module 'pnu.metrics' has no attribute {name!r}")
