@@ -1,0 +1,277 @@
+"""Point clouds: ply, xyz, txt, pcd, obj, off, npy."""
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pnu.io.atomic import atomic_path
+from pnu.io.mesh import Geometry, as_colors, ply_normals, read_obj, read_off, write_obj, write_off, xyz_columns
+from pnu.io.pcd import read_pcd, write_pcd
+from pnu.io.ply import read_ply, write_ply
+from pnu.io.text import known_suffix, open_file, table, text_lines
+
+LARGEST = 1e30  # beyond, squared distances leave the range of float64 or what float32 can hold after scaling
+NORMAL_FIELDS = {".ply": ("nx", "ny", "nz"), ".pcd": ("normal_x", "normal_y", "normal_z")}
+
+
+class Cloud(NamedTuple):
+    """Points (n, 3) float64, unit normals (n, 3) float64 or None, and what else the file says about each point.
+
+    attributes: name -> (n,) or (n, k). Colours are "colors", (n, 3) or (n, 4) uint8.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray | None
+    attributes: dict[str, np.ndarray]
+
+
+def read_cloud(path: str | Path, *, minimum: int = 16, normals: bool = True) -> Cloud:
+    """Read a point cloud; normals are brought to unit length, or left out with `normals=False`.
+
+    Text has three columns (x y z) or six (x y z and a normal, or a colour where the last three are no unit vectors);
+    of a mesh the vertices are taken. Coordinates stay float64.
+
+    Raises `ValueError` (one line: file, what was expected, what was found, what to do) for a missing, empty, damaged
+    or unknown file, fewer than `minimum` points, NaN or infinity, points that are all equal, and normals of length 0.
+    """
+    path = Path(path)
+    suffix = open_file(path, "point cloud", CLOUD_SUFFIXES)
+    cloud = READERS[suffix](path)
+    if not normals:
+        cloud = cloud._replace(normals=None)
+    return check_cloud(cloud, str(path), minimum=minimum)
+
+
+def check_cloud(cloud: Cloud, name: str, *, minimum: int = 16) -> Cloud:
+    """The cloud with float64 points and unit normals; `ValueError`, beginning with `name`, if it cannot be used."""
+    points = np.asarray(cloud.points, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"{name}: expected points of shape (n, 3), found {points.shape}; give one row a point")
+    count = len(points)
+    if count < minimum:
+        raise ValueError(f"{name}: holds {count} points; at least {minimum} are needed")
+    bad = np.flatnonzero(~(np.abs(points) < LARGEST).all(axis=1))
+    if len(bad):
+        raise ValueError(
+            f"{name}: {len(bad)} of {count} points hold NaN, infinity or numbers beyond {LARGEST:g} "
+            f"(the first: number {bad[0] + 1}); remove them"
+        )
+    if count > 1 and np.ptp(points, axis=0).max() <= max(1e-12 * np.abs(points).max(), 1 / LARGEST):
+        raise ValueError(f"{name}: all {count} points are equal; expected points on a surface")
+    normals = cloud.normals
+    if normals is not None:
+        normals = np.asarray(normals, np.float64)
+        if normals.shape != points.shape:
+            raise ValueError(f"{name}: expected normals of shape {points.shape}, found {normals.shape}")
+        cure = "repair them, or have all normals estimated (normals=estimate)"
+        bad = np.flatnonzero(~np.isfinite(normals).all(axis=1))
+        if len(bad):
+            raise ValueError(
+                f"{name}: {len(bad)} of {count} normals hold NaN or infinity (the first: number {bad[0] + 1}); {cure}"
+            )
+        normals = normals / np.maximum(np.abs(normals).max(axis=1, keepdims=True), 1e-300)
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        bad = np.flatnonzero(lengths < 0.5)
+        if len(bad):
+            raise ValueError(
+                f"{name}: {len(bad)} of {count} normals have length zero (the first: number {bad[0] + 1}); {cure}"
+            )
+        normals = normals / lengths
+    return Cloud(points, normals, dict(cloud.attributes))
+
+
+def write_cloud(
+    path: str | Path,
+    points: np.ndarray,
+    normals: np.ndarray | None = None,
+    attributes: Mapping[str, np.ndarray] | None = None,
+) -> None:
+    """Write points (n, 3), normals (n, 3) and attributes (n,) or (n, k) atomically, in the format of the suffix.
+
+    ply and pcd are binary, keep attributes, and hold coordinates as float32 where that is exact, else as float64;
+    the other formats hold no attributes (see `keeps_attributes`). npy is an array (n, 3) or (n, 6) of float64.
+    """
+    path = Path(path)
+    suffix = known_suffix(path, "point cloud", CLOUD_SUFFIXES)
+    points = np.asarray(points, np.float64)
+    cloud = Cloud(points, None if normals is None else np.asarray(normals, np.float64), dict(attributes or {}))
+    for name, values in (cloud.attributes | ({} if cloud.normals is None else {"normals": cloud.normals})).items():
+        if len(values) != len(points):
+            raise ValueError(f"{path}: expected {len(points)} rows of '{name}', one a point, found {np.shape(values)}")
+    with atomic_path(path) as temporary:
+        WRITERS[suffix](temporary, cloud)
+
+
+def keeps_attributes(path: str | Path) -> bool:
+    """Whether the format of this suffix holds colours and scalars beside points and normals."""
+    return Path(path).suffix.lower() in NORMAL_FIELDS
+
+
+def _read_text(path: Path) -> Cloud:
+    def lines() -> Iterator[str]:
+        return (line.replace(",", " ").replace(";", " ").replace("//", "#") for line in text_lines(path))
+
+    return _from_table(path, table(path, lines))
+
+
+def _read_npy(path: Path) -> Cloud:
+    try:
+        # Mapped first: a header that promises more than the file holds fails before anything is allocated.
+        values = np.load(path, mmap_mode="r", allow_pickle=False)
+    except Exception as error:  # numpy parses the header as Python and lets many kinds of error through
+        reason = (str(error).splitlines() or [""])[0][:80]
+        raise ValueError(f"{path}: is no npy file of numbers ({reason}); save it again") from None
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu" or values.ndim != 2:
+        found = f"{values.dtype} {values.shape}" if isinstance(values, np.ndarray) else "an archive"
+        raise ValueError(f"{path}: expected an array (n, 3) or (n, 6) of numbers, found {found}")
+    return _from_table(path, np.array(values, np.float64))
+
+
+def _from_table(path: Path, values: np.ndarray) -> Cloud:
+    """Three columns are points; three more are normals where they are unit vectors, or zero, and else colours."""
+    if not values.size:
+        raise ValueError(f"{path}: holds no numbers; expected x y z, or x y z and a normal, in each line")
+    points, more = values[:, :3], values[:, 3:]
+    if values.shape[1] == 3:
+        return Cloud(points, None, {})
+    if values.shape[1] != 6:
+        raise ValueError(
+            f"{path}: has {values.shape[1]} columns; expected 3 (x y z) or 6 (x y z nx ny nz), remove the others"
+        )
+    with np.errstate(over="ignore", invalid="ignore"):
+        lengths = np.linalg.norm(more, axis=1)
+    lengths = lengths[np.isfinite(lengths) & (lengths > 0)]
+    if not len(lengths) or np.mean(np.abs(lengths - 1) < 0.05) > 0.9:
+        return Cloud(points, more, {})
+    if more.min() >= 0 and (more.max() <= 1 or (more.max() <= 255 and np.array_equal(more, np.rint(more)))):
+        return Cloud(points, None, {"colors": as_colors(more)})
+    raise ValueError(
+        f"{path}: columns 4 to 6 are neither unit normals (median length {np.median(lengths):.3g}) nor colours "
+        "(0..1 or 0..255); scale the normals to length 1 or remove them"
+    )
+
+
+def _read_ply(path: Path) -> Cloud:
+    columns = {name: v for name, v in read_ply(path, {"vertex"}).get("vertex", {}).items() if isinstance(v, np.ndarray)}
+    return _from_columns(path, columns, NORMAL_FIELDS[".ply"])
+
+
+def _read_pcd(path: Path) -> Cloud:
+    columns = read_pcd(path)
+    for name in ("rgb", "rgba"):
+        packed = columns.pop(name, None)
+        if packed is not None and packed.ndim == 1 and packed.itemsize == 4:
+            blue, green, red, alpha = packed.view(np.uint32)[:, None].view(np.uint8).reshape(-1, 4).T
+            columns["colors"] = np.stack([red, green, blue, alpha][: len(name)], axis=1)
+    return _from_columns(path, columns, NORMAL_FIELDS[".pcd"])
+
+
+def _from_columns(path: Path, columns: dict[str, np.ndarray], normal: tuple[str, ...]) -> Cloud:
+    def take(names: tuple[str, ...]) -> np.ndarray | None:
+        if any(name not in columns or columns[name].ndim != 1 for name in names):
+            return None
+        return np.stack([columns.pop(name) for name in names], axis=1)
+
+    points = take(("x", "y", "z"))
+    if points is None:
+        raise ValueError(f"{path}: expected points with x y z, found {' '.join(columns) or 'none'}; save it again")
+    normals = take(normal)
+    colors = take(("red", "green", "blue", "alpha"))
+    colors = take(("red", "green", "blue")) if colors is None else colors
+    if colors is not None:
+        columns["colors"] = colors if colors.dtype == np.uint8 else as_colors(colors)
+    return Cloud(points.astype(np.float64), normals, columns)
+
+
+def _from_geometry(read: Callable[[Path], Geometry]) -> Callable[[Path], Cloud]:
+    def cloud(path: Path) -> Cloud:
+        geometry = read(path)
+        return Cloud(
+            geometry.vertices, geometry.normals, {} if geometry.colors is None else {"colors": geometry.colors}
+        )
+
+    return cloud
+
+
+def _write_text(path: Path, cloud: Cloud) -> None:
+    rows, form = _joined(cloud), "%.15g %.15g %.15g" + ("" if cloud.normals is None else " %.9g %.9g %.9g")
+    np.savetxt(path, rows, form)
+
+
+def _joined(cloud: Cloud) -> np.ndarray:
+    return cloud.points if cloud.normals is None else np.hstack([cloud.points, cloud.normals])
+
+
+def _storable(attributes: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Attributes in types that ply and pcd know; blanks in names become _."""
+    result = {}
+    for name, values in attributes.items():
+        values = np.asarray(values)
+        if values.dtype.kind == "b":
+            values = values.astype(np.uint8)
+        elif values.dtype == np.float16:
+            values = values.astype(np.float32)
+        elif values.dtype.kind not in "iuf" or values.itemsize > 4:
+            values = values.astype(np.float64)
+        result["_".join(name.split())] = values
+    return result
+
+
+def _write_ply(path: Path, cloud: Cloud) -> None:
+    columns = xyz_columns(cloud.points) | ply_normals(cloud.normals)
+    for name, values in _storable(cloud.attributes).items():
+        if name == "colors" and values.ndim == 2 and values.shape[1] in (3, 4):
+            values = values if values.dtype == np.uint8 else as_colors(values)
+            columns |= dict(zip(("red", "green", "blue", "alpha"), values.T, strict=False))
+        elif values.ndim == 1:
+            columns[name] = values
+        else:
+            columns |= {f"{name}_{i}": column for i, column in enumerate(values.reshape(len(values), -1).T)}
+    write_ply(path, columns)
+
+
+def _write_pcd(path: Path, cloud: Cloud) -> None:
+    fields = xyz_columns(cloud.points)
+    if cloud.normals is not None:
+        fields |= dict(zip(NORMAL_FIELDS[".pcd"], cloud.normals.T.astype(np.float32), strict=True))
+    for name, values in _storable(cloud.attributes).items():
+        if name == "colors" and values.ndim == 2 and values.shape[1] in (3, 4):
+            values = values if values.dtype == np.uint8 else as_colors(values)
+            packed = np.zeros((len(values), 4), np.uint8)
+            packed[:, :3] = values[:, 2::-1]
+            packed[:, 3] = values[:, 3] if values.shape[1] == 4 else 0
+            fields["rgb" if values.shape[1] == 3 else "rgba"] = packed.view(np.uint32)[:, 0]
+        else:
+            fields[name] = values
+    write_pcd(path, fields)
+
+
+def _write_npy(path: Path, cloud: Cloud) -> None:
+    np.save(path, _joined(cloud), allow_pickle=False)
+
+
+def _write_geometry(write: Callable[[Path, Geometry], None]) -> Callable[[Path, Cloud], None]:
+    return lambda path, cloud: write(path, Geometry(cloud.points, np.empty((0, 3), np.int64), cloud.normals))
+
+
+READERS: dict[str, Callable[[Path], Cloud]] = {
+    ".ply": _read_ply,
+    ".xyz": _read_text,
+    ".txt": _read_text,
+    ".pcd": _read_pcd,
+    ".obj": _from_geometry(read_obj),
+    ".off": _from_geometry(read_off),
+    ".npy": _read_npy,
+}
+WRITERS: dict[str, Callable[[Path, Cloud], None]] = {
+    ".ply": _write_ply,
+    ".xyz": _write_text,
+    ".txt": _write_text,
+    ".pcd": _write_pcd,
+    ".obj": _write_geometry(write_obj),
+    ".off": _write_geometry(write_off),
+    ".npy": _write_npy,
+}
+CLOUD_SUFFIXES = frozenset(READERS)

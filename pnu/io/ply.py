@@ -1,0 +1,243 @@
+"""The Stanford format: any elements and properties, in text or binary of either byte order."""
+
+import struct
+from collections.abc import Mapping
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pnu.io.text import table
+
+TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"},
+    **{"double": "f8", "float64": "f8", "int64": "i8", "uint64": "u8"},
+}
+NAMES = {
+    **{"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"},
+    **{"f4": "float", "f8": "double"},
+}
+
+
+class Property(NamedTuple):
+    """`length` is the type of the count in front of a list, empty for a scalar."""
+
+    name: str
+    type: str
+    length: str
+
+
+class Element(NamedTuple):
+    name: str
+    size: int
+    properties: list[Property]
+
+
+class Lists(NamedTuple):
+    """A list property: `counts` (n,) entries each, all `values` in a row."""
+
+    counts: np.ndarray
+    values: np.ndarray
+
+
+Columns = dict[str, np.ndarray | Lists]
+
+
+def read_ply(path: Path, wanted: set[str]) -> dict[str, Columns]:
+    """Columns of the wanted elements by property name. Counts that the file's size cannot hold are refused unread."""
+    data = path.read_bytes()
+    order, elements, start = _header(path, data)
+    found: dict[str, Columns] = {}
+    if order is None:
+        lines = iter(data[start:].decode("ascii", "replace").splitlines())
+        rows = (line for line in lines if line.strip())
+        del data
+    for element in elements:
+        if not wanted - found.keys():
+            break
+        if order is None:
+            columns = _text(path, element, list(islice(rows, element.size)))
+        else:
+            columns, start = _binary(path, data, start, element, order)
+        if element.name in wanted:
+            found[element.name] = columns
+    return found
+
+
+def _header(path: Path, data: bytes) -> tuple[str | None, list[Element], int]:
+    """Byte order ("<", ">", None for text), elements, and where the body starts."""
+    end = data.find(b"end_header")
+    if not data.startswith(b"ply") or end < 0:
+        raise ValueError(f"{path}: expected a ply header from 'ply' to 'end_header', found none; is it another format?")
+    order: str | None = ""
+    elements: list[Element] = []
+    for line in data[:end].decode("ascii", "replace").splitlines()[1:]:
+        words = line.split()
+        try:
+            match words:
+                case ["format", kind, _]:
+                    order = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}[kind]
+                case ["element", name, count] if int(count) >= 0:
+                    elements.append(Element(name, int(count), []))
+                case ["property", "list", length, kind, name] if TYPES[length][0] in "iu":
+                    elements[-1].properties.append(Property(name, TYPES[kind], TYPES[length]))
+                case ["property", kind, name] if kind != "list":
+                    elements[-1].properties.append(Property(name, TYPES[kind], ""))
+                case [] | ["comment" | "obj_info", *_]:
+                    pass
+                case _:
+                    raise ValueError(line)
+        except (ValueError, KeyError, IndexError):
+            raise ValueError(f"{path}: '{line.strip()[:60]}' is no line of a ply header; save the file again") from None
+    if order == "":
+        raise ValueError(f"{path}: the ply header has no format line; save the file again")
+    for element in elements:
+        names = [item.name for item in element.properties]
+        if len(set(names)) < len(names):
+            raise ValueError(f"{path}: element '{element.name}' has two properties of one name; save the file again")
+    newline = data.find(b"\n", end)
+    return order, elements, newline + 1 if newline >= 0 else len(data)
+
+
+def _short(path: Path, element: Element, found: str) -> ValueError:
+    return ValueError(
+        f"{path}: the header promises {element.size} of element '{element.name}', the file holds {found}; "
+        "it is cut off or damaged, copy it again"
+    )
+
+
+def _text(path: Path, element: Element, lines: list[str]) -> Columns:
+    if len(lines) < element.size:
+        raise _short(path, element, str(len(lines)))
+    names = [item.name for item in element.properties]
+    if not any(item.length for item in element.properties):
+        values = table(path, lambda: lines) if lines else np.empty((0, len(names)))
+        if values.shape != (element.size, len(names)):
+            raise ValueError(
+                f"{path}: element '{element.name}' has {len(names)} properties, its lines {values.shape[1]} columns; "
+                "save the file again"
+            )
+        with np.errstate(invalid="ignore"):
+            return {item.name: values[:, i].astype(item.type) for i, item in enumerate(element.properties)}
+    columns: dict[str, list[float]] = {name: [] for name in names}
+    counts: dict[str, list[int]] = {item.name: [] for item in element.properties if item.length}
+    for line in lines:
+        words = iter(line.split())
+        try:
+            for item in element.properties:
+                take = 1
+                if item.length:
+                    take = int(next(words))
+                    counts[item.name].append(take)
+                taken = [float(word) for word in islice(words, max(take, 0))]
+                if len(taken) != take:
+                    raise ValueError
+                columns[item.name] += taken
+        except (ValueError, StopIteration):
+            raise ValueError(
+                f"{path}: '{line.strip()[:40]}' does not fit element '{element.name}'; save the file again"
+            ) from None
+    result: Columns = {}
+    with np.errstate(invalid="ignore"):
+        for item in element.properties:
+            values = np.array(columns[item.name], dtype=np.float64).astype(item.type)
+            result[item.name] = Lists(np.array(counts[item.name], dtype=np.int64), values) if item.length else values
+    return result
+
+
+def _binary(path: Path, data: bytes, start: int, element: Element, order: str) -> tuple[Columns, int]:
+    """Columns of an element that begins at byte `start`, and where it ends."""
+    least = sum(np.dtype(item.length or item.type).itemsize for item in element.properties)
+    if element.size * least > len(data) - start:
+        raise _short(path, element, f"{len(data) - start} bytes more")
+    if element.size == 0 or least == 0:
+        return {item.name: np.empty(0, item.type) for item in element.properties}, start
+    lengths, _ = _row_lengths(data, start, element, order)
+    dtype = _row_dtype(element, order, lengths)
+    if element.size * dtype.itemsize <= len(data) - start:
+        rows = np.frombuffer(data, dtype, element.size, start)
+        if all(np.all(rows[f"{name} count"] == length) for name, length in lengths.items()):
+            return _columns(element, rows, lengths), start + rows.nbytes
+    return _ragged(path, data, start, element, order)
+
+
+def _row_lengths(data: bytes, start: int, element: Element, order: str) -> tuple[dict[str, int], int]:
+    """Length of each list in the row at byte `start`, and where the row ends; `struct.error` where it is cut off."""
+    lengths: dict[str, int] = {}
+    for item in element.properties:
+        take = 1
+        if item.length:
+            code = np.dtype(order + item.length)
+            if start + code.itemsize > len(data):
+                raise struct.error
+            take = max(int(np.frombuffer(data, code, 1, start)[0]), 0)
+            lengths[item.name] = take
+            start += code.itemsize
+        start += take * np.dtype(item.type).itemsize
+    if start > len(data):
+        raise struct.error
+    return lengths, start
+
+
+def _row_dtype(element: Element, order: str, lengths: Mapping[str, int]) -> np.dtype:
+    fields: list[tuple] = []
+    for item in element.properties:
+        if item.length:
+            fields.append((f"{item.name} count", order + item.length))
+            fields.append((item.name, order + item.type, (lengths[item.name],)))
+        else:
+            fields.append((item.name, order + item.type))
+    return np.dtype(fields)
+
+
+def _columns(element: Element, rows: np.ndarray, lengths: Mapping[str, int]) -> Columns:
+    result: Columns = {}
+    for item in element.properties:
+        values = rows[item.name].astype(item.type)
+        if item.length:
+            result[item.name] = Lists(np.full(len(rows), lengths[item.name], dtype=np.int64), values.reshape(-1))
+        else:
+            result[item.name] = values
+    return result
+
+
+def _ragged(path: Path, data: bytes, start: int, element: Element, order: str) -> tuple[Columns, int]:
+    """Rows whose lists differ in length, one after the other."""
+    rows: list[Columns] = []
+    for number in range(element.size):
+        try:
+            lengths, end = _row_lengths(data, start, element, order)
+        except struct.error:
+            raise _short(path, element, str(number)) from None
+        rows.append(_columns(element, np.frombuffer(data, _row_dtype(element, order, lengths), 1, start), lengths))
+        start = end
+    result: Columns = {}
+    for item in element.properties:
+        parts = [row[item.name] for row in rows]
+        if item.length:
+            counts = np.concatenate([part.counts for part in parts if isinstance(part, Lists)])
+            result[item.name] = Lists(counts, np.concatenate([p.values for p in parts if isinstance(p, Lists)]))
+        else:
+            result[item.name] = np.concatenate([part for part in parts if not isinstance(part, Lists)])
+    return result, start
+
+
+def write_ply(path: Path, vertex: Mapping[str, np.ndarray], faces: np.ndarray | None = None) -> None:
+    """Binary little-endian ply of vertex properties (n,) and, if given, triangles (f, 3)."""
+    dtype = np.dtype([(name, values.dtype.newbyteorder("<")) for name, values in vertex.items()])
+    rows = np.empty(len(next(iter(vertex.values()))), dtype)
+    for name, values in vertex.items():
+        rows[name] = values
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    header += [f"property {NAMES[values.dtype.str[1:]]} {name}" for name, values in vertex.items()]
+    if faces is not None:
+        header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    with path.open("wb") as handle:
+        handle.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii", "replace"))
+        rows.tofile(handle)
+        if faces is not None:
+            triangles = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", (3,))])
+            triangles["count"], triangles["corners"] = 3, faces
+            triangles.tofile(handle)

@@ -1,0 +1,81 @@
+"""Tables of numbers in text, with errors that name the line."""
+
+from collections.abc import Callable, Iterable, Iterator
+from itertools import chain
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+
+
+def open_file(path: Path, content: str, suffixes: Iterable[str]) -> str:
+    """The lower-case suffix of an existing file that is not empty; `ValueError` otherwise."""
+    suffix = known_suffix(path, content, suffixes)
+    if path.is_dir():
+        raise ValueError(f"{path}: is a folder; give the file of a {content}")
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file; give the path of a {content}")
+    if not path.stat().st_size:
+        raise ValueError(f"{path}: the file is empty; expected a {content}")
+    return suffix
+
+
+def known_suffix(path: Path, content: str, suffixes: Iterable[str]) -> str:
+    suffix = path.suffix.lower()
+    if suffix not in suffixes:
+        found = f"the suffix '{path.suffix}'" if path.suffix else "no suffix"
+        raise ValueError(f"{path}: {found} is not a format of a {content}; use one of {' '.join(sorted(suffixes))}")
+    return suffix
+
+
+def text_lines(path: Path) -> Iterator[str]:
+    """Lines of a text file."""
+    with path.open("rb") as handle:
+        if b"\0" in handle.read(4096):
+            raise ValueError(f"{path}: holds binary data; expected text, as the suffix '{path.suffix}' says")
+    with path.open(encoding="utf-8", errors="replace") as handle:
+        yield from handle
+
+
+def table(path: Path, lines: Callable[[], Iterable[str]], *, first_line: int = 1) -> np.ndarray:
+    """Numbers in columns, (rows, columns) float64; blank lines and # comments are skipped.
+
+    `lines` gives the lines anew at each call: they are read a second time to name the one that is wrong.
+    """
+    rows = iter(lines())
+    head = next((line for line in rows if line.split("#")[0].strip()), None)
+    if head is None:
+        return np.empty((0, 0))
+    try:
+        return np.loadtxt(chain([head], rows), comments="#", ndmin=2)
+    except ValueError:
+        _blame(path, lines(), first_line)
+
+
+def _blame(path: Path, lines: Iterable[str], first_line: int) -> NoReturn:
+    width = 0
+    for number, line in enumerate(lines, first_line):
+        tokens = line.split("#")[0].split()
+        for token in tokens:
+            try:
+                float(token)
+            except ValueError:
+                raise ValueError(
+                    f"{path}: line {number}: expected numbers, found '{token[:30]}'; remove or comment (#) that line"
+                ) from None
+        if tokens and width and len(tokens) != width:
+            raise ValueError(
+                f"{path}: line {number} has {len(tokens)} columns, those before have {width}; the file may be cut off"
+            )
+        width = width or len(tokens)
+    raise ValueError(f"{path}: cannot be read as a table of numbers; check its lines")
+
+
+def fan(counts: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Triangles (f, 3) of polygons given as counts (p,) and their corners in a row; each is cut as a fan."""
+    starts = np.cumsum(counts) - counts
+    triangles = np.maximum(counts - 2, 0)
+    polygon = np.repeat(np.arange(len(counts)), triangles)
+    step = np.arange(triangles.sum()) - np.repeat(np.cumsum(triangles) - triangles, triangles)
+    first = starts[polygon]
+    return np.stack([corners[first], corners[first + step + 1], corners[first + step + 2]], axis=1).astype(np.int64)
