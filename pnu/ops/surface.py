@@ -106,7 +106,7 @@ def _pieces(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, float]:
 
 def _closest_on_triangle(query: np.ndarray, triangle: np.ndarray) -> np.ndarray:
     """Closest point of triangles (..., 3, 3) to query (..., 3): the plane's if inside, else the best of the edges'."""
-    best, best_sq = triangle[..., 0, :], np.inf
+    best, best_sq = triangle[..., 0, :], np.full(triangle.shape[:-2], np.inf)
     for i in range(3):
         start = triangle[..., i, :]
         edge = triangle[..., (i + 1) % 3, :] - start
