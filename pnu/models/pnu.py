@@ -1,0 +1,115 @@
+"""The network of the authors' released code: PointNet++ local features, PointNet global features, x2 reshapes."""
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from pnu.models.layers import MLP, Abstraction, Propagation, expand, hierarchy
+
+RADII = (0.1, 0.2, 0.3, 0.4)
+NEIGHBORS = 32
+MINIMUM = 64  # points of a patch: the coarsest level keeps one in 64
+
+
+class LocalFeatures(nn.Module):
+    """Four set abstractions (n, n/4, n/16, n/64 points) and four feature propagations: (B, n, C) -> (B, n, 256)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        widths = ((channels - 3, 32, 32, 64), (64, 64, 64, 128), (128, 128, 128, 256), (256, 256, 256, 512))
+        self.abstractions = nn.ModuleList(map(Abstraction, widths))
+        self.propagations = nn.ModuleList(
+            [
+                Propagation(128, channels, 128, 256),
+                Propagation(128, 64, 128, 128),
+                Propagation(256, 128, 128, 128),
+                Propagation(512, 256, 128, 256),
+            ]
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        levels = hierarchy(x[..., :3].detach(), RADII, NEIGHBORS)
+        points = [x[..., :3], *(level.points for level in levels)]
+        features, skips = x[..., 3:], [x]
+        for abstraction, finer, level in zip(self.abstractions, points, levels, strict=False):
+            features = abstraction(finer, features, level)
+            skips.append(features)
+        for i in reversed(range(len(levels))):
+            features = self.propagations[i](points[i], points[i + 1], skips[i], features)
+        return features
+
+
+class PNU(nn.Module):
+    """Point and normal upsampling network, as released: patches (B, n, 6) -> (B, ratio n, 6), n >= 64.
+
+    Patches hold points in the unit sphere and their unit normals; predicted normals are not normalised.
+
+    Args:
+        ratio: points predicted for each input point: 2, 4, 8 or 16.
+        input_normals: read the normals of the patch; without, they are ignored and may be missing.
+        predict_normals: predict normals beside points; without, the output has 3 columns.
+        local_features: PointNet++ features of each point (256).
+        global_features: PointNet features of the patch (512).
+
+    Source: Sharma et al., "Point Cloud Upsampling and Normal Estimation using Deep Learning for Robust Surface
+    Reconstruction", and its released code, which takes PointNet++ for the local features of Fig. 1.
+    """
+
+    local: ClassVar[type[nn.Module]] = LocalFeatures
+    local_width: ClassVar[int] = 256
+
+    def __init__(
+        self,
+        ratio: int = 4,
+        input_normals: bool = True,
+        predict_normals: bool = True,
+        local_features: bool = True,
+        global_features: bool = True,
+    ) -> None:
+        super().__init__()
+        if ratio not in (2, 4, 8, 16):
+            raise ValueError(f"model.ratio: expected 2, 4, 8 or 16, got {ratio!r}")
+        self.ratio, self.patch_size = ratio, 1024
+        self.predicts_normals = predict_normals
+        self.channels = 6 if input_normals else 3
+        self.local_features = self.local(self.channels) if local_features else None
+        self.global_features = MLP((self.channels, 32, 64, 64, 128, 256, 512)) if global_features else None
+        width = self.channels + (self.local_width if local_features else 0) + (512 if global_features else 0)
+        self.head = MLP((width, 512, 256, 128))
+        # Released, ratio 4: 128 | 64-64-32 | 16-16. Other ratios keep these widths at both ends.
+        steps = ratio.bit_length() - 1
+        outputs = [64] * max(steps - 2, 0) + [32] * min(steps - 1, 1)
+        inputs = [width // 2 for width in (128, *outputs)]
+        self.expansions = nn.ModuleList(
+            [MLP((width, width, out)) for width, out in zip(inputs[:-1], outputs, strict=True)]
+            + [MLP((inputs[-1], inputs[-1]))]
+        )
+        self.regression = nn.Linear(inputs[-1], 6 if predict_normals else 3)
+
+    def forward(self, patch: Tensor) -> Tensor:
+        """Patches (B, n, 6) -> (B, ratio n, 6), or (B, ratio n, 3) without normals."""
+        batch, n, columns = patch.shape
+        if columns < self.channels or n < MINIMUM:
+            raise ValueError(f"patch: expected (B, n >= {MINIMUM}, {self.channels}), got {tuple(patch.shape)}")
+        x = patch[..., : self.channels].contiguous()
+        parts = [x]
+        if self.local_features is not None:
+            parts.append(self.local_features(x))
+        if self.global_features is not None:
+            parts.append(self.global_features(x).amax(1, keepdim=True).expand(-1, n, -1))
+        features = self.head(torch.cat(parts, -1))
+        for mlp in self.expansions:
+            features = mlp(expand(features))
+        points = self.regression(features)
+        # the released order: all first halves, then all second ones, the last expansion outermost
+        steps = len(self.expansions)
+        return (
+            points.unflatten(1, (n, *[2] * steps))
+            .permute(0, *range(steps + 1, 0, -1), -1)
+            .reshape(batch, -1, points.shape[-1])
+        )
+
+    def outputs(self, patch: Tensor) -> dict[str, Tensor]:
+        """What the loss may read: here the prediction alone."""
+        return {"prediction": self(patch)}
