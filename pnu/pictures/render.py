@@ -15,6 +15,7 @@ Image = NDArray[np.uint8]
 
 CLAY = (222, 224, 228)  # a surface without colours
 BACK = (214, 180, 160)  # the inside of a surface, seen through a hole or because it is inside out
+STONE = (130, 142, 160)  # points without colours and normals
 CREASE_DEG = 40.0  # edges sharper than this stay sharp under smooth shading
 
 
@@ -54,7 +55,7 @@ def render_cloud(
         seen = (normals / np.where(length > 0, length, 1)) @ camera.rotation.T
         normal = 0.35 * normal + 0.65 * np.where(seen[:, 2:] < 0, -seen, seen)[owner]
     if colors is None:
-        colors = normal_colors(normals) if normals is not None else np.tile(np.uint8([130, 142, 160]), (len(points), 1))
+        colors = normal_colors(normals) if normals is not None else np.tile(np.array(STONE, np.uint8), (len(points), 1))
     return develop(found.pixel, center[owner, 2] + rise, normal, np.asarray(colors)[owner] / 255, pixels, supersample)
 
 
