@@ -1,7 +1,7 @@
 """Files: the only room that knows formats. What is read is checked; what is written appears whole or not at all."""
 
-from pnu.io.atomic import atomic_path, read_json, write_json
-from pnu.io.cloud import CLOUD_SUFFIXES, Cloud, check_cloud, keeps_attributes, read_cloud, write_cloud
+from pnu.io.atomic import atomic_path, check_writable, read_json, write_json
+from pnu.io.cloud import CLOUD_SUFFIXES, Cloud, check_cloud, check_output, keeps_attributes, read_cloud, write_cloud
 from pnu.io.mesh import MESH_SUFFIXES, Mesh, read_mesh, write_mesh
 
 __all__ = [
@@ -11,6 +11,8 @@ __all__ = [
     "Mesh",
     "atomic_path",
     "check_cloud",
+    "check_output",
+    "check_writable",
     "keeps_attributes",
     "read_cloud",
     "read_json",

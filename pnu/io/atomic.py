@@ -17,10 +17,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     Raises `ValueError` where the folder does not exist, `path` is a folder, or the system refuses to write.
     """
     path = Path(path)
-    if path.is_dir():
-        raise ValueError(f"{path}: is a folder; give the name of a file to write")
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: the folder {path.parent} does not exist; create it first")
+    check_writable(path)
     temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:12]}{path.suffix}")
     try:
         yield temporary
@@ -34,6 +31,17 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise ValueError(f"{path}: cannot be written ({reason}); free space or choose another folder") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def check_writable(path: str | Path) -> None:
+    """`ValueError` where a file of this name could not be written: to know it before the work, not after."""
+    path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"{path}: is a folder; give the name of a file to write")
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: the folder {path.parent} does not exist; create it first")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise ValueError(f"{path}: the folder {path.parent} cannot be written to; choose another one")
 
 
 def write_json(path: str | Path, content: Any) -> None:

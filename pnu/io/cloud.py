@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pnu.io.atomic import atomic_path
+from pnu.io.atomic import atomic_path, check_writable
 from pnu.io.mesh import Geometry, as_colors, ply_normals, read_obj, read_off, write_obj, write_off, xyz_columns
 from pnu.io.pcd import read_pcd, write_pcd
 from pnu.io.ply import read_ply, write_ply
@@ -90,8 +90,9 @@ def write_cloud(
 ) -> None:
     """Write points (n, 3), normals (n, 3) and attributes (n,) or (n, k) atomically, in the format of the suffix.
 
-    ply and pcd are binary, keep attributes, and hold coordinates as float32 where that is exact, else as float64;
-    the other formats hold no attributes (see `keeps_attributes`). npy is an array (n, 3) or (n, 6) of float64.
+    ply and pcd are binary and keep attributes (see `keeps_attributes`); the other formats do not. Coordinates are
+    float64 in npy, which is an array (n, 3) or (n, 6); float32 in ply where that is exact, in pcd where it is good to
+    a millionth of the extent, and float64 otherwise.
     """
     path = Path(path)
     suffix = known_suffix(path, "point cloud", CLOUD_SUFFIXES)
@@ -102,6 +103,12 @@ def write_cloud(
             raise ValueError(f"{path}: expected {len(points)} rows of '{name}', one a point, found {np.shape(values)}")
     with atomic_path(path) as temporary:
         WRITERS[suffix](temporary, cloud)
+
+
+def check_output(path: str | Path) -> None:
+    """`ValueError` where `write_cloud` would refuse this name: unknown suffix, no such folder, not writable."""
+    known_suffix(Path(path), "point cloud", CLOUD_SUFFIXES)
+    check_writable(path)
 
 
 def keeps_attributes(path: str | Path) -> bool:
@@ -233,7 +240,10 @@ def _write_ply(path: Path, cloud: Cloud) -> None:
 
 
 def _write_pcd(path: Path, cloud: Cloud) -> None:
-    fields = xyz_columns(cloud.points)
+    # Most readers of pcd know coordinates as float32 only.
+    single = cloud.points.astype(np.float32)
+    enough = np.abs(single - cloud.points).max(initial=0) <= 1e-6 * np.ptp(cloud.points, axis=0).max(initial=0)
+    fields = dict(zip("xyz", (single if enough else cloud.points).T, strict=True))
     if cloud.normals is not None:
         fields |= dict(zip(NORMAL_FIELDS[".pcd"], cloud.normals.T.astype(np.float32), strict=True))
     for name, values in _storable(cloud.attributes).items():
