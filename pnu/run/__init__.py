@@ -31,8 +31,12 @@ dataclass and conf/ do not know, also in a multirun, before the function is call
 tracebacks. A field of dataclass type is a group: the keys that any of `conf/<group>/*.yaml` may have.
 """
 
+from pnu.run.build import build
 from pnu.run.command import command
 from pnu.run.config import compose_config
+from pnu.run.folder import RunFolder, is_main_process
+from pnu.run.resume import open_run
 from pnu.run.schema import doc
+from pnu.run.table import closing
 
-__all__ = ["command", "compose_config", "doc"]
+__all__ = ["RunFolder", "build", "closing", "command", "compose_config", "doc", "is_main_process", "open_run"]

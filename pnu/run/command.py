@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from pnu.run.config import check_keys, composer, config_folder, variations
+from pnu.run.config import check_keys, composer, config_folder, in_multirun, one_line, variations
 from pnu.run.help import help_text
 from pnu.run.schema import check
 
@@ -72,20 +72,8 @@ def stop(error: Exception) -> typing.NoReturn:
     sys.exit(2)
 
 
-def one_line(error: BaseException) -> str:
-    """An exception's message on one line."""
-    return " ".join(str(error).split()) or type(error).__name__
-
-
 def full_errors() -> bool:
     return os.environ.get("HYDRA_FULL_ERROR") == "1"
-
-
-def in_multirun() -> bool:
-    """Whether the code runs as one job of several that a sweeper started."""
-    from hydra.core.hydra_config import HydraConfig
-
-    return HydraConfig.initialized() and str(HydraConfig.get().mode) == "RunMode.MULTIRUN"
 
 
 @contextmanager

@@ -35,9 +35,7 @@ def composer(name: str, extra_folder: str | None = None) -> Iterator[Callable[..
         except MissingConfigException as error:
             group, _, choice = (error.missing_cfg_file or "?").rpartition("/")
             known = ", ".join(sorted(error.options or []))
-            raise ValueError(
-                f"{group}={choice}: expected one of {known}" if known else " ".join(str(error).split())
-            ) from None
+            raise ValueError(f"{group}={choice}: expected one of {known}" if known else one_line(error)) from None
         except (HydraException, OmegaConfBaseException) as error:
             cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
             raise ValueError(str(cause).strip().splitlines()[0]) from None
@@ -125,3 +123,15 @@ def flatten(tree: Any, prefix: str = "") -> dict[str, Any]:
         if isinstance(value, dict):
             nodes |= flatten(value, f"{prefix}{name}.")
     return nodes
+
+
+def in_multirun() -> bool:
+    """Whether the code runs as one job of several that a sweeper started."""
+    from hydra.core.hydra_config import HydraConfig
+
+    return HydraConfig.initialized() and str(HydraConfig.get().mode) == "RunMode.MULTIRUN"
+
+
+def one_line(error: BaseException) -> str:
+    """An exception's message on one line."""
+    return " ".join(str(error).split()) or type(error).__name__

@@ -10,13 +10,9 @@ from pnu.run.schema import fields
 
 def shown(value: Any) -> str:
     """A value as one types it."""
-    if isinstance(value, float):
-        return f"{value:g}"
-    return (
-        {None: "null", True: "true", False: "false"}.get(value, str(value))
-        if not hasattr(value, "keys")
-        else str(value)
-    )
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def help_text(schema: type, program: str, cfg: Any) -> str:
@@ -29,7 +25,8 @@ def help_text(schema: type, program: str, cfg: Any) -> str:
         hints = typing.get_type_hints(schema)
         for name, field in fields(schema).items():
             key = f"{prefix}{name}"
-            if name not in list(cfg):  # `in cfg` would leave out those that are still ???
+            # `in cfg` would leave out those that are still ???; underscores are Hydra's, set by the choice of a group
+            if name not in list(cfg) or name.startswith("_"):
                 continue
             if dataclasses.is_dataclass(hints[name]):
                 options = sorted(path.stem for path in (config_folder() / key.replace(".", "/")).glob("*.yaml"))
@@ -39,7 +36,7 @@ def help_text(schema: type, program: str, cfg: Any) -> str:
             else:
                 missing = OmegaConf.is_missing(cfg, name)
                 value = "..." if missing else shown(cfg[name])
-                lines.append(f"  {key + '=' + value:<38} {field.metadata['doc']}")
+                lines.append(f"  {key + '=' + value:<40} {field.metadata['doc']}")
 
     describe(schema, cfg, "")
     usage = f"usage: {program} [key=value ...]      (-m key=a,b: one run for each value)"

@@ -29,7 +29,7 @@ def known_keys(schema: type, prefix: str = "") -> dict[str, str]:
 
 
 def nearest_key(key: str, known: Sequence[str]) -> str:
-    """The known key that a mistyped one most likely means; its last part may match alone (epochs: trainer.max_epochs)."""
+    """The known key that a mistyped one most likely means, by its whole or last part (epochs: trainer.max_epochs)."""
 
     def likeness(candidate: str) -> float:
         whole = difflib.SequenceMatcher(None, key, candidate).ratio()

@@ -1,0 +1,297 @@
+"""What happens beside the training steps: checkpoints, progress, pictures."""
+
+import math
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import lightning.pytorch as pl
+import numpy as np
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+from omegaconf import OmegaConf
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch.utils.tensorboard.summary import hparams
+
+from pnu.checkpoint import read
+from pnu.io import atomic_path
+from pnu.ops.colors import normal_colors
+from pnu.pictures import figure, look_at, render_cloud, save_png
+from pnu.run import RunFolder, build
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Writes checkpoints that appear whole or not at all; reads tensors and plain types only."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        with atomic_path(path) as temporary:
+            torch.save(checkpoint, temporary)
+
+    def load_checkpoint(self, path: Any, map_location: Any = "cpu", weights_only: bool | None = True) -> dict[str, Any]:
+        return read(path)
+
+
+class Checkpoints(pl.Callback):
+    """Saves last.ckpt at intervals and at the end, and best.ckpt when a validation value is the smallest so far.
+
+    Args:
+        run: whose checkpoints these are; its metrics.json gets the best validation.
+        every_n_steps: training steps between two last.ckpt; 0: only time counts.
+        every_minutes: minutes between two last.ckpt; 0: only steps count.
+        monitor: validation value.
+    """
+
+    def __init__(
+        self, run: RunFolder, every_n_steps: int = 500, every_minutes: float = 5, monitor: str = "val/chamfer_sq"
+    ) -> None:
+        if every_n_steps < 0 or every_minutes < 0:
+            raise ValueError("callbacks.checkpoints: expected every_n_steps and every_minutes of 0 or more")
+        self.run, self.monitor = run, monitor
+        self.every_n_steps, self.every_s = every_n_steps, 60 * every_minutes
+        self.best = math.inf
+        self.saved_step, self.saved_at, self.due = 0, time.monotonic(), False
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"best": self.best}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.best = float(state_dict["best"])
+
+    def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
+        step = trainer.global_step
+        if step == self.saved_step:  # gradients are still being accumulated
+            return
+        by_steps = self.every_n_steps and step % self.every_n_steps == 0
+        by_time = self.every_s and time.monotonic() - self.saved_at >= self.every_s
+        # all processes must save together, and their clocks differ
+        self.due = trainer.strategy.broadcast(bool(by_steps or by_time))
+        # Lightning takes a validation for done when it goes on from a checkpoint between the step and the validation
+        if self.due and not validation_follows(trainer):
+            self.save_last(trainer)
+
+    def on_validation_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if trainer.state.fn != "fit":
+            return
+        found = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("val/")}
+        if self.monitor not in found:
+            known = ", ".join(sorted(found))
+            raise ValueError(f"callbacks.checkpoints.monitor={self.monitor}: expected one of {known}")
+        if found[self.monitor] < self.best:
+            self.best = found[self.monitor]
+            trainer.save_checkpoint(self.run.best, weights_only=True)
+            self.run.add_metrics("validation", {**found, "step": trainer.global_step})
+        if self.due:
+            self.save_last(trainer)
+
+    def on_train_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        self.save_last(trainer)
+
+    def save_last(self, trainer: pl.Trainer) -> None:
+        trainer.save_checkpoint(self.run.last)
+        self.saved_step, self.saved_at, self.due = trainer.global_step, time.monotonic(), False
+
+
+def validation_follows(trainer: pl.Trainer) -> bool:
+    """Whether Lightning validates after the step that just ended."""
+    loop = trainer.fit_loop
+    assert loop._data_fetcher is not None
+    return loop.epoch_loop._should_check_val_fx(loop._data_fetcher)
+
+
+class ProgressBar(pl.Callback):
+    """One bar for the whole training: step, loss, validation and time left; a line at each validation where there is
+    no terminal."""
+
+    def __init__(self) -> None:
+        self.validation = ""
+        self.started_at = (0.0, 0)
+
+    def on_train_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if not trainer.is_global_zero:
+            return
+        total = trainer.estimated_stepping_batches
+        self.bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[text]}"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+        )
+        step = trainer.global_step
+        self.task = self.bar.add_task(
+            "train", total=int(total) if math.isfinite(total) else None, completed=step, text=""
+        )
+        self.started_at = (time.monotonic(), step)
+        if self.bar.console.is_terminal:
+            self.bar.start()
+
+    def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
+        if trainer.is_global_zero:
+            loss = float(trainer.callback_metrics.get("train/loss", math.nan))
+            text = f"epoch {trainer.current_epoch + 1}  loss {loss:.4g}  {self.validation}"
+            self.bar.update(self.task, completed=trainer.global_step, text=text)
+
+    def on_validation_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if trainer.state.fn != "fit" or not trainer.is_global_zero:
+            return
+        self.validation = f"val CD {1e3 * float(trainer.callback_metrics['val/chamfer_sq']):.4g}e-3"
+        if not self.bar.console.is_terminal:
+            seconds, steps = time.monotonic() - self.started_at[0], trainer.global_step - self.started_at[1]
+            total = self.bar.tasks[0].total
+            left = f", {(total - trainer.global_step) * seconds / steps:.0f} s left" if total and steps else ""
+            print(f"step {trainer.global_step}: {self.validation} ({seconds:.0f} s{left})", flush=True)
+
+    def on_train_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if trainer.is_global_zero:
+            self.bar.stop()
+
+    def on_exception(self, trainer: pl.Trainer, module: pl.LightningModule, exception: BaseException) -> None:
+        if hasattr(self, "bar"):
+            self.bar.stop()
+
+
+class Pictures(pl.Callback):
+    """Shows the same validation clouds during training: as 3D clouds in TensorBoard, coloured by normal, and as PNGs,
+    there and in the run folder, beside input and target.
+
+    Args:
+        run: whose folder pictures/ gets the PNGs.
+        clouds: how many, each of another shape as far as there are as many; 0: none.
+        points: of a 3D cloud at most, more make the tab slow.
+        every: validations from one picture to the next; the last one of a training is always drawn.
+        size: pixels of a panel's side.
+    """
+
+    def __init__(self, run: RunFolder, clouds: int = 4, points: int = 4096, every: int = 10, size: int = 320) -> None:
+        if clouds < 0 or min(points, every, size) < 1:
+            raise ValueError("callbacks.pictures: expected clouds >= 0 and points, every, size >= 1")
+        self.folder, self.clouds, self.points, self.every, self.size = run.pictures, clouds, points, every, size
+        self.seen = 0
+        self.drawn = -1
+        self.samples: list[dict[str, Any]] = []
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"seen": self.seen}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.seen = int(state_dict["seen"])
+
+    def on_validation_batch_end(
+        self, trainer: pl.Trainer, module: pl.LightningModule, outputs: Any, batch: Any, *_: Any
+    ) -> None:
+        """Choose the clouds while the first validation runs: the first of each shape."""
+        for i, shape in enumerate(batch["shape"]):
+            if len(self.samples) < self.clouds and shape not in {sample["shape"] for sample in self.samples}:
+                cloud = {name: batch[name][i].float().cpu() for name in ("input", "target")}
+                self.samples.append({"shape": shape, **cloud})
+
+    def on_validation_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if self.seen % self.every == 0:
+            self.draw(trainer, module)
+        if trainer.state.fn == "fit":
+            self.seen += 1
+
+    def on_train_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if self.drawn != trainer.global_step:
+            self.draw(trainer, module)
+
+    def draw(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if not trainer.is_global_zero:
+            return
+        first, self.drawn = self.drawn < 0, trainer.global_step
+        training, writer = module.training, board(trainer)
+        module.eval()
+        for sample in self.samples:
+            with torch.no_grad():
+                prediction = module(sample["input"][None].to(module.device))[0].float().cpu()
+            clouds = {"prediction": prediction.numpy()}
+            if first:
+                clouds |= {name: sample[name].numpy() for name in ("input", "target")}
+            for name, cloud in clouds.items():
+                if writer is not None:
+                    shown = cloud[:: -(-len(cloud) // self.points)]
+                    tag = f"{sample['shape']}/{name}"
+                    writer.add_mesh(tag, shown[None, :, :3], normal_colors(unit(shown))[None], global_step=self.drawn)
+            picture = self.picture(sample, prediction.numpy())
+            if picture is not None:
+                save_png(self.folder / f"{sample['shape']}_{self.drawn:07d}.png", picture)
+                if writer is not None:
+                    writer.add_image(sample["shape"], picture, self.drawn, dataformats="HWC")
+        module.train(training)
+
+    def picture(self, sample: dict[str, Any], prediction: np.ndarray) -> np.ndarray | None:
+        """Input, prediction and target side by side (h, w, 3); None where the prediction is no picture yet."""
+        clouds = {"input": sample["input"].numpy(), "prediction": prediction, "target": sample["target"].numpy()}
+        for camera in (look_at(clouds["target"]), look_at(*clouds.values())):
+            try:
+                panels = [
+                    render_cloud(cloud[:, :3], normal_colors(unit(cloud)), camera=camera, size=self.size)
+                    for cloud in clouds.values()
+                ]
+                return figure(panels, list(clouds))
+            except ValueError:  # an untrained network may put all points where the camera does not look
+                continue
+        return None
+
+
+class Board(pl.Callback):
+    """Writes to TensorBoard what is known once: the config as text, and at the end the hyperparameters with the final
+    metrics."""
+
+    def __init__(self, config: Mapping[str, Any]) -> None:
+        self.config = config
+
+    def on_fit_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if trainer.is_global_zero and (writer := board(trainer)) is not None:
+            text = OmegaConf.to_yaml(OmegaConf.create(dict(self.config)))
+            writer.add_text("config", "".join(f"    {line}\n" for line in text.splitlines()), trainer.global_step)
+
+    def on_test_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if trainer.is_global_zero and (writer := board(trainer)) is not None:
+            metrics = {
+                name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("test/")
+            }
+            for summary in hparams(hyperparameters(self.config), metrics):
+                writer.file_writer.add_summary(summary)
+            writer.flush()
+
+
+def hyperparameters(config: Mapping[str, Any], prefix: str = "") -> dict[str, bool | int | float | str]:
+    """The config's values under their dotted keys, as TensorBoard wants them."""
+    flat: dict[str, bool | int | float | str] = {}
+    for name, value in config.items():
+        if isinstance(value, Mapping):
+            flat |= hyperparameters(value, f"{prefix}{name}.")
+        elif value is not None and not str(name).startswith("_partial_"):
+            flat[f"{prefix}{name}"] = value if isinstance(value, bool | int | float | str) else str(value)
+    return flat
+
+
+def board(trainer: pl.Trainer) -> Any:
+    """TensorBoard's SummaryWriter, or None."""
+    return next((x.experiment for x in trainer.loggers if isinstance(x, TensorBoardLogger)), None)
+
+
+def unit(cloud: np.ndarray) -> np.ndarray:
+    """Unit normals (n, 3) of a cloud (n, 6); zeros, shown grey, for a cloud without normals."""
+    if cloud.shape[1] < 6:
+        return np.zeros((len(cloud), 3))
+    return cloud[:, 3:6] / np.maximum(np.linalg.norm(cloud[:, 3:6], axis=1, keepdims=True), 1e-12)
+
+
+def build_all(config: Mapping[str, Any], run: RunFolder) -> list[pl.Callback]:
+    """The callbacks of a training. Checkpoints come last: they save what the others have become."""
+    found: list[pl.Callback] = [Board(config)] if config["quiet"] else [Board(config), ProgressBar()]
+    for group in config["callbacks"].values():
+        ours = str(group.get("_target_")).startswith("pnu.")
+        found.append(build(group, "pnu.callbacks", run=run) if ours else build(group, "lightning.pytorch.callbacks"))
+    return sorted(found, key=lambda callback: isinstance(callback, Checkpoints))
+
+
+def build_logger(config: Mapping[str, Any], run: RunFolder) -> Any:
+    """The logger, or False for none. What a run that goes on has logged after its last checkpoint is taken back."""
+    more = {"purge_step": read(run.last)["global_step"]} if run.last.exists() else {}
+    return build(config["logger"], "lightning.pytorch.loggers", save_dir=run.path, **more) or False

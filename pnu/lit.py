@@ -1,0 +1,159 @@
+"""Training as Lightning sees it: one step, one validation, the optimizer."""
+
+import inspect
+import logging
+import math
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+from lightning.pytorch.utilities.types import OptimizerLRScheduler
+from torch import Tensor, nn
+
+from pnu.metrics import CloudMetrics
+
+Batch = Mapping[str, Any]
+
+
+# What is not for the user to choose: our own callbacks save, show progress and pictures; the data's sampler knows
+# about processes; values are logged at every step.
+TRAINER_OPTIONS = {
+    "enable_checkpointing": False,
+    "enable_progress_bar": False,
+    "enable_model_summary": False,
+    "num_sanity_val_steps": 0,
+    "inference_mode": False,  # its tensors would stay in the metrics, of no use to the training after them
+    "use_distributed_sampler": False,
+}
+NOISE = (  # warnings of Lightning and torch that ask for what is meant as it is
+    ".*does not have many workers.*",
+    ".*is smaller than the logging interval.*",
+    ".*Checkpoint directory .* exists and is not empty.*",
+    ".*Found .* module.s. in eval mode at the start of training.*",
+    ".*You're resuming from a checkpoint that ended before the epoch ended.*",
+    ".*treespec.*is deprecated.*",
+)
+
+
+def quieten() -> None:
+    """Silence Lightning's advice and start-up lines; its errors and other warnings stay."""
+    for name in ("lightning.pytorch", "lightning.fabric", "pytorch_lightning"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    for message in NOISE:
+        warnings.filterwarnings("ignore", message=message)
+
+
+class NonFinite(ValueError):
+    """NaN or infinity in the loss or its gradient; the message names the step and the term."""
+
+
+class UpsamplingModule(pl.LightningModule):
+    """A network and its loss.
+
+    A batch has "input" (B, n, 6), "target" (B, m, 6) and whatever else the loss reads. Logged are every loss term at
+    every step (train/cd ... train/loss), the norm of the gradient, the learning rate, and the metrics of
+    `CloudMetrics` over validation (val/...) and test (test/...) clouds, each in the frame of its patch.
+
+    Args:
+        model: maps patches (B, n, 6) to (B, ratio n, 6 or 3).
+        loss: called with prediction, target and extra; gives terms by name and their weighted sum as "loss".
+        optimizer: called with the parameters.
+        scheduler: called with the optimizer, stepped after each step. What it calls `total_steps` or `T_max` is the
+            number of steps of the whole training.
+    """
+
+    model: Any  # a network: an nn.Module with outputs()
+
+    def __init__(
+        self,
+        model: nn.Module,
+        loss: nn.Module | None = None,
+        optimizer: Callable[..., torch.optim.Optimizer] | None = None,
+        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+    ) -> None:
+        super().__init__()
+        self.model = model
+        self.loss = loss
+        self.optimizer, self.scheduler = optimizer, scheduler
+        normals = bool(getattr(model, "predicts_normals", True))
+        self.val_metrics, self.test_metrics = CloudMetrics(normals), CloudMetrics(normals)
+
+    def forward(self, patch: Tensor) -> Tensor:
+        return self.model(patch)
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        assert self.loss is not None
+        outputs = {name: value.float() for name, value in self.model.outputs(batch["input"]).items()}
+        # searches and small differences of coordinates want float32, whatever the network computed in
+        with torch.autocast(self.device.type, enabled=False):
+            terms = self.loss(outputs["prediction"], batch["target"], {**batch, **outputs})
+        self.check_finite({name: value.detach() for name, value in terms.items()}, batch)
+        self.log_dict(
+            {f"train/{name}": value.detach() for name, value in terms.items()}, batch_size=len(batch["input"])
+        )
+        return terms["loss"]
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        gradients = [p.grad for p in self.parameters() if p.grad is not None]
+        norm = torch.nn.utils.get_total_norm(gradients) if gradients else torch.zeros(())
+        self.log_dict({"train/gradient_norm": norm, "train/lr": optimizer.param_groups[0]["lr"]})
+        if self.trainer.precision != "16-mixed":  # whose scaler expects infinite gradients and skips their step
+            self.check_finite({"gradient": norm}, self.last_batch)
+
+    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
+        self.last_batch = batch
+
+    def on_train_batch_end(self, outputs: Any, batch: Batch, batch_idx: int) -> None:
+        self.last_batch = {}
+
+    def check_finite(self, values: Mapping[str, Tensor], batch: Batch) -> None:
+        """Stop the training at NaN or infinity and keep the batch for inspection.
+
+        Raises:
+            NonFinite: names the step, the terms and the file with the batch.
+        """
+        broken = [name for name, value in values.items() if not math.isfinite(float(value))]
+        if not broken:
+            return
+        path = Path(self.trainer.default_root_dir) / f"nonfinite_step{self.global_step}_rank{self.global_rank}.pt"
+        content = {"step": self.global_step, "terms": {k: float(v) for k, v in values.items()}, "batch": dict(batch)}
+        torch.save(content, path)
+        first = next((name for name in broken if name != "loss"), broken[0])
+        raise NonFinite(
+            f"step {self.global_step}: {first} is {float(values[first])}; the batch is in {path};"
+            " a lower optimizer.lr or trainer.gradient_clip_val=1 often cures it"
+        )
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        self.val_metrics.update(self(batch["input"]).float(), batch["target"])
+
+    def on_validation_epoch_end(self) -> None:
+        self.log_metrics("val", self.val_metrics)
+
+    def test_step(self, batch: Batch, batch_idx: int) -> None:
+        self.test_metrics.update(self(batch["input"]).float(), batch["target"])
+
+    def on_test_epoch_end(self) -> None:
+        self.log_metrics("test", self.test_metrics)
+
+    def log_metrics(self, stage: str, metrics: CloudMetrics) -> None:
+        # compute() has added up all processes already
+        self.log_dict({f"{stage}/{name}": value for name, value in metrics.compute().items()}, rank_zero_only=False)
+        metrics.reset()
+
+    def configure_optimizers(self) -> OptimizerLRScheduler:
+        assert self.optimizer is not None
+        optimizer = self.optimizer(self.parameters())
+        if self.scheduler is None:
+            return optimizer
+        cls = getattr(self.scheduler, "func", self.scheduler)
+        horizon = {"total_steps", "T_max"} & inspect.signature(cls).parameters.keys()
+        if horizon and not math.isfinite(steps := self.trainer.estimated_stepping_batches):
+            raise ValueError(
+                "scheduler: needs to know the number of steps; give trainer.max_epochs or trainer.max_steps"
+            )
+        scheduler = self.scheduler(optimizer, **{name: int(steps) for name in horizon})
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}

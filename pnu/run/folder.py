@@ -1,0 +1,176 @@
+"""One run, one folder: config.yaml, checkpoints/, tensorboard/, pictures/, metrics.json and run.json."""
+
+import datetime
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from pnu.io import atomic_path, read_json, write_json
+
+PACKAGES = ("pnu", "torch", "lightning", "numpy", "scipy", "hydra-core")
+# keys that change where or how a run is told about, not what it computes
+UNHASHED = ("run", "resume", "name", "quiet", "logger")
+
+
+class RunFolder:
+    """Paths of a run folder, and its record run.json."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.config = self.path / "config.yaml"
+        self.last = self.path / "checkpoints" / "last.ckpt"
+        self.best = self.path / "checkpoints" / "best.ckpt"
+        self.metrics = self.path / "metrics.json"
+        self.pictures = self.path / "pictures"
+        self.record_path = self.path / "run.json"
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    @classmethod
+    def create(cls, config: Mapping[str, Any]) -> "RunFolder":
+        """The folder `config["run"]`, or a new one under outputs/<date>/, with its config.yaml.
+
+        Raises:
+            ValueError: there is a run in it already.
+        """
+        wanted = config.get("run")
+        folder = cls(wanted or new_path(str(config["name"])))
+        if folder.record_path.exists():
+            status = read_json(folder.record_path).get("status")
+            raise ValueError(
+                f"run={folder}: holds a run ({status}); resume=true goes on with it, or choose another folder"
+            )
+        for name in ("checkpoints", "tensorboard", "pictures"):
+            (folder.path / name).mkdir(parents=True, exist_ok=True)
+        folder.write_config(config)
+        return folder
+
+    @classmethod
+    def existing(cls, path: str | Path | None) -> "RunFolder":
+        """The run folder at `path`; ValueError if it isn't one."""
+        if path is None:
+            raise ValueError("resume=true needs run=FOLDER, the run to go on with")
+        folder = cls(path)
+        for file in (folder.config, folder.record_path):
+            if not file.is_file():
+                raise ValueError(f"run={path}: expected a run folder with {file.name}, found none")
+        return folder
+
+    def write_config(self, config: Mapping[str, Any]) -> None:
+        from omegaconf import OmegaConf
+
+        with atomic_path(self.config) as temporary:
+            temporary.write_text(OmegaConf.to_yaml(OmegaConf.create(dict(config))), encoding="utf-8")
+
+    def read_record(self) -> dict[str, Any]:
+        return read_json(self.record_path) if self.record_path.exists() else {}
+
+    def add_metrics(self, section: str, values: Mapping[str, float]) -> None:
+        """Put metrics under a section of metrics.json, such as "test"; their names lose their stage (test/...)."""
+        if is_main_process():
+            known = read_json(self.metrics) if self.metrics.exists() else {}
+            values = {name.rpartition("/")[2]: float(value) for name, value in values.items()}
+            write_json(self.metrics, {**known, section: values})
+
+    @contextmanager
+    def recorded(self, config: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+        """run.json tells the state of what runs inside: running at once, then finished, or failed with the error.
+
+        Gives the record; what the block adds to it is written at the end.
+        """
+        if not is_main_process():
+            yield {}
+            return
+        before = self.read_record()
+        record = {
+            "status": "running",
+            "command": shlex.join([Path(sys.executable).name, *sys.orig_argv[1:]]),
+            "started": before.get("started", now()),
+            "resumed": [*before.get("resumed", []), *([now()] if before else [])],
+            "pid": os.getpid(),
+            "host": platform.node(),
+            "versions": versions(),
+            "git": git_revision(),
+            "seed": config.get("seed"),
+            "ratio": config.get("model", {}).get("ratio"),
+            "config_hash": config_hash(config),
+            "wall_s": before.get("wall_s", 0.0),
+        }
+        start = time.monotonic()
+        write_json(self.record_path, record)
+        try:
+            yield record
+            record["status"] = "finished"
+        except BaseException as error:
+            record["status"] = "failed"
+            stopped = isinstance(error, KeyboardInterrupt | SystemExit)
+            record["error"] = "interrupted" if stopped else f"{type(error).__name__}: {' '.join(str(error).split())}"
+            raise
+        finally:
+            record["ended"] = now()
+            record["wall_s"] = round(before.get("wall_s", 0.0) + time.monotonic() - start, 3)
+            write_json(self.record_path, record)
+
+
+def new_path(name: str) -> Path:
+    """outputs/<date>/<time>_<name>, which does not exist yet: two runs that start together get two folders."""
+    day, clock = datetime.datetime.now().strftime("%Y-%m-%d %H-%M-%S").split()
+    parent = Path("outputs") / day
+    parent.mkdir(parents=True, exist_ok=True)
+    for suffix in ("", *(f"_{i}" for i in range(2, 1000))):
+        try:
+            (path := parent / f"{clock}_{name}{suffix}").mkdir()
+            return path
+        except FileExistsError:
+            continue
+    raise ValueError(f"{parent}: holds 1000 runs of this second; give run=FOLDER")
+
+
+def config_hash(config: Mapping[str, Any]) -> str:
+    """Of what determines the result; the same for two runs that compute the same."""
+    content = {key: value for key, value in config.items() if key not in UNHASHED}
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+def versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def git_revision() -> str | None:
+    """Of the checkout that the package runs from, with "+" if it has changes; None outside a checkout."""
+    here = Path(__file__).resolve().parents[2]
+    if not (here / ".git").exists():
+        return None
+    try:
+        options = {"cwd": here, "capture_output": True, "text": True, "timeout": 10, "check": True}
+        revision = subprocess.run(["git", "rev-parse", "HEAD"], **options).stdout.strip()  # type: ignore[call-overload]
+        changes = subprocess.run(["git", "status", "--porcelain", "-uno"], **options).stdout  # type: ignore[call-overload]
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return revision + ("+" if changes.strip() else "")
+
+
+def now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+
+
+def is_main_process() -> bool:
+    """Whether this process is the first of a distributed run, or the only one."""
+    return all(os.environ.get(name, "0") == "0" for name in ("LOCAL_RANK", "NODE_RANK", "RANK", "SLURM_PROCID"))

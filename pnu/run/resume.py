@@ -1,0 +1,92 @@
+"""Open the run folder of a training: a new one, or the one to go on with."""
+
+import os
+import shlex
+from collections.abc import Sequence
+from typing import Any
+
+from pnu.run.config import flatten, in_multirun
+from pnu.run.folder import RunFolder, is_main_process
+from pnu.run.schema import check
+
+# What may change when a run goes on: how long, where and how loud, not what is learnt.
+FREE = (
+    "run",
+    "resume",
+    "quiet",
+    "data.workers",
+    "trainer.max_epochs",
+    "trainer.max_steps",
+    "trainer.max_time",
+    "trainer.accelerator",
+    "trainer.devices",
+    "trainer.num_nodes",
+    "trainer.strategy",
+    "trainer.profiler",
+    "trainer.limit_test_batches",
+    "callbacks.checkpoints.every_n_steps",
+    "callbacks.checkpoints.every_minutes",
+    "callbacks.pictures.every",
+)
+VARIABLE = "PNU_RUN"  # tells the processes that a distributed training starts which folder is the run's
+
+
+def open_run(cfg: Any, schema: type) -> tuple[RunFolder, dict[str, Any]]:
+    """The run folder and the plain config of a training.
+
+    With `resume` the config is the folder's own; the command line may change what `FREE` lists. Without, the folder is
+    new, or `run` where given; in a multirun it is the job's folder below the sweep's.
+
+    Raises:
+        ValueError: not a run folder, a run where a new one shall be, or an override that a run cannot take.
+    """
+    from omegaconf import OmegaConf
+
+    config: Any = OmegaConf.to_container(cfg, resolve=True)
+    overrides, job_folder = hydra_job()
+    if config["resume"]:
+        run = RunFolder.existing(config["run"])
+        config = restored(run, config, overrides, schema)
+        if is_main_process():
+            run.write_config(config)
+        return run, config
+    if not is_main_process():
+        path = os.environ.get(VARIABLE) or config["run"]
+        if path is None:
+            raise ValueError("run=FOLDER must be given where torchrun or SLURM starts the processes: all need the same")
+        return RunFolder(path), config
+    config["run"] = config["run"] or job_folder
+    run = RunFolder.create(config)
+    os.environ[VARIABLE] = str(run.path.absolute())
+    return run, config
+
+
+def hydra_job() -> tuple[list[str], str | None]:
+    """The overrides of this job, and its folder if it is one of a multirun."""
+    from hydra.core.hydra_config import HydraConfig
+
+    if not HydraConfig.initialized():
+        return [], None
+    hydra = HydraConfig.get()
+    return list(hydra.overrides.task), hydra.runtime.output_dir if in_multirun() else None
+
+
+def restored(run: RunFolder, config: dict[str, Any], overrides: Sequence[str], schema: type) -> dict[str, Any]:
+    """The config of a run folder, with those values of `config` that the overrides set and a run can take."""
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError
+
+    try:
+        saved = check(OmegaConf.load(run.config), schema)
+    except (OmegaConfBaseException, YAMLError, AttributeError, TypeError) as error:
+        raise ValueError(f"{run.config}: expected the config of a run, found {' '.join(str(error).split())}") from None
+    known = set(shlex.split(str(run.read_record().get("command", ""))))
+    values = flatten(config)
+    for override in overrides:
+        key = override.partition("=")[0].lstrip("+~")
+        if key in FREE:
+            OmegaConf.update(saved, key, values[key], force_add=True)
+        elif override not in known:  # repeating the command that started the run does no harm
+            raise ValueError(f"{override}: a run that goes on keeps its config; what may change: {', '.join(FREE)}")
+    return OmegaConf.to_container(saved)  # type: ignore[return-value]

@@ -1,0 +1,34 @@
+"""What a training prints at its end."""
+
+from pnu.io import read_json
+from pnu.run.folder import RunFolder
+
+# metric -> how a table shows it: name, factor, format
+SHOWN = {
+    "chamfer_sq": ("CD x 1e3", 1e3, ".3f"),
+    "hausdorff_sq": ("HD (squared) x 1e3", 1e3, ".2f"),
+    "spacing_cv": ("spacing, variation", 1.0, ".3f"),
+    "normal_deg": ("normal error, signed (deg)", 1.0, ".1f"),
+    "normal_unsigned_deg": ("normal error, unsigned (deg)", 1.0, ".1f"),
+    "flipped": ("normals flipped (%)", 100.0, ".1f"),
+}
+TITLES = {"untrained": "untrained", "validation": "best validation", "test": "test"}
+
+
+def closing(run: RunFolder) -> str:
+    """The metrics of a run as a table, its folder, and the command to go on with."""
+    found = read_json(run.metrics)
+    columns = [name for name in TITLES if name in found]
+    rows = [["each patch in its unit sphere", *(TITLES[name] for name in columns)]]
+    for metric, (title, factor, form) in SHOWN.items():
+        values = [found[column].get(metric) for column in columns]
+        if any(value is not None for value in values):
+            rows.append([title, *("-" if value is None else format(factor * value, form) for value in values)])
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = [
+        "  ".join([row[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True))])
+        for row in rows
+    ]
+    lines.insert(1, "-" * len(lines[0]))
+    upsample = f"python -m pnu.upsample input=cloud.ply output=dense.ply run={run}"
+    return "\n".join(["", *lines, "", f"run folder: {run}", f"next: {upsample}"])

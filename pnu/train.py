@@ -1,0 +1,71 @@
+"""Train an upsampling network: `python -m pnu.train [key=value ...]`; `--help` lists the keys."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from pnu.run import build, closing, command, doc, is_main_process, open_run
+from pnu.run.groups import Callbacks, Data, Logger, Loss, Model, Optimizer, Scheduler, Trainer
+
+
+@dataclass
+class Train:
+    """Train an upsampling network. Ends with its test metrics and a run folder for `python -m pnu.upsample`."""
+
+    seed: int = doc("of the weights, the order of the data and their augmentation")
+    name: str = doc("last part of the run folder's name")
+    run: str | None = doc("run folder; null: outputs/<date>/<time>_<name>")
+    resume: bool = doc("go on with the run in run=FOLDER, with its config, from its last checkpoint")
+    quiet: bool = doc("print the run folder alone")
+    data: Data = doc("Data")
+    model: Model = doc("Network")
+    loss: Loss = doc("Loss")
+    optimizer: Optimizer = doc("Optimizer")
+    scheduler: Scheduler = doc("Learning rate, stepped after each training step")
+    trainer: Trainer = doc("Training, by Lightning's Trainer")
+    callbacks: Callbacks = doc("Beside the training")
+    logger: Logger = doc("Logger")
+
+
+def train(cfg: Any) -> dict[str, float]:
+    """Train as the config says; the test metrics of the best weights by name."""
+    run, config = open_run(cfg, Train)
+    with run.recorded(config) as record:
+        import lightning.pytorch as pl  # seconds: only once the config is known to be good
+
+        from pnu import callbacks, lit, models
+        from pnu.checkpoint import read
+
+        lit.quieten()
+        pl.seed_everything(config["seed"], verbose=False)
+        data = build(config["data"], "pnu.data")
+        model = models.build(config["model"])
+        loss = build(config["loss"], "pnu.losses")
+        optimizer = build(config["optimizer"], "torch.optim")
+        scheduler = build(config["scheduler"], "torch.optim.lr_scheduler")
+        module = lit.UpsamplingModule(model, loss, optimizer, scheduler)
+        trainer = build(
+            config["trainer"],
+            "lightning.pytorch",
+            callbacks=callbacks.build_all(config, run),
+            logger=callbacks.build_logger(config, run),
+            default_root_dir=run.path,
+            **lit.TRAINER_OPTIONS,
+        )
+        record["device"] = str(trainer.strategy.root_device)
+        start = run.last if run.last.exists() else None
+        if start is None:
+            run.add_metrics("untrained", trainer.validate(module, data, verbose=False)[0])
+        trainer.fit(module, data, ckpt_path=start, weights_only=True)
+        if run.best.exists():
+            module.load_state_dict(read(run.best)["state_dict"])
+        test = trainer.test(module, data, verbose=False)[0]
+        run.add_metrics("test", test)
+    if is_main_process():
+        print(run if config["quiet"] else closing(run))
+    return dict(test)
+
+
+main = command(train, Train)
+
+if __name__ == "__main__":
+    main()
