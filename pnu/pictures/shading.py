@@ -31,6 +31,7 @@ def shifted(image: Image, rows: int, columns: int, fill: float) -> Image:
     """result[r, c] = image[r + rows, c + columns], `fill` beyond the border."""
     result = np.full_like(image, fill)
     h, w = image.shape
+    rows, columns = np.clip(rows, -h, h), np.clip(columns, -w, w)
     to = np.s_[max(-rows, 0) : h - max(rows, 0), max(-columns, 0) : w - max(columns, 0)]
     of = np.s_[max(rows, 0) : h + min(rows, 0), max(columns, 0) : w + min(columns, 0)]
     result[to] = image[of]
