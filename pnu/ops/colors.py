@@ -66,6 +66,11 @@ def value_colors(values: NDArray, limits: tuple[float, float], colormap: str = "
     return np.rint(255 * rgb).astype(np.uint8)
 
 
+def typical_limit(errors: NDArray) -> float:
+    """The end of a colour scale that starts at 0: what 98 % of the errors stay below."""
+    return float(np.quantile(errors, 0.98)) or float(errors.max()) or 1e-12
+
+
 def normal_colors(normals: NDArray) -> Colors:
     """Colours `(n, 3)` of unit normals `(n, 3)`: x, y, z from -1..1 to red, green, blue from 0..255."""
     return np.rint(127.5 * (np.clip(normals, -1, 1) + 1)).astype(np.uint8)

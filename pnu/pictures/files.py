@@ -1,0 +1,78 @@
+"""Panels of cloud and mesh files."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnu.io import CLOUD_SUFFIXES, MESH_SUFFIXES, Mesh, read_cloud, read_mesh
+from pnu.io.mesh import READERS
+from pnu.ops.colors import normal_colors, typical_limit, value_colors
+from pnu.ops.mesh import vertex_normals
+from pnu.pictures.camera import Camera
+from pnu.pictures.figure import ColorBar
+from pnu.pictures.render import STONE, render_cloud, render_mesh
+
+COLORS = ("auto", "quality", "stored", "normal", "plain")
+
+
+class Shape(NamedTuple):
+    """What a file shows."""
+
+    path: str
+    points: NDArray[np.float64]  # (n, 3), of a mesh its vertices
+    normals: NDArray[np.float64] | None  # (n, 3)
+    mesh: Mesh | None
+    attributes: dict[str, NDArray]
+
+    def source(self, color: str) -> str:
+        """What a choice of COLORS means here: never auto. ValueError where the file lacks it."""
+        needs = {"quality": "quality" in self.attributes, "stored": "colors" in self.attributes}
+        needs |= {"normal": self.normals is not None, "plain": True}
+        if color == "auto":
+            return next(name for name in COLORS[1:] if needs[name] and not (name == "normal" and self.mesh is not None))
+        if not needs[color]:
+            raise ValueError(f"{self.path}: holds nothing for color={color}; use color=auto, or another file")
+        return color
+
+    def colors(self, color: str, bar: ColorBar | None) -> NDArray[np.uint8] | None:
+        """Colours `(n, 3)` of the points; None for the surface's own."""
+        source = self.source(color)
+        if source == "quality" and bar is not None:
+            return value_colors(self.attributes["quality"], bar.limits, bar.colormap)
+        if source == "stored":
+            return self.attributes["colors"][:, :3]
+        if source == "normal" and self.normals is not None:
+            return normal_colors(self.normals)
+        return None if self.mesh is not None else np.tile(np.array(STONE, np.uint8), (len(self.points), 1))
+
+    def draw(
+        self, camera: Camera, color: str, bar: ColorBar | None, *, size: int, radius: float | None, smooth: bool
+    ) -> NDArray[np.uint8]:
+        """The panel, `(size, size, 3)`."""
+        colors = self.colors(color, bar)
+        if self.mesh is not None:
+            return render_mesh(self.mesh, colors, camera=camera, size=size, smooth=smooth)
+        cloud = self.points if self.normals is None else np.hstack([self.points, self.normals])
+        return render_cloud(cloud, colors, camera=camera, size=size, radius=radius)
+
+
+def read_shape(path: str) -> Shape:
+    """A file with faces as a mesh, any other as a cloud. ValueError as in `pnu.io`."""
+    suffix = Path(path).suffix.lower()
+    if suffix in MESH_SUFFIXES and Path(path).is_file() and len(READERS[suffix](Path(path)).faces):
+        mesh = read_mesh(path)
+        attributes = read_cloud(path, minimum=3, normals=False).attributes if suffix in CLOUD_SUFFIXES else {}
+        return Shape(path, mesh.vertices, vertex_normals(mesh), mesh, attributes)
+    cloud = read_cloud(path, minimum=1)
+    return Shape(path, cloud.points, cloud.normals, None, cloud.attributes)
+
+
+def quality_bar(shapes: Sequence[Shape], color: str, limit: float | None, colormap: str, label: str) -> ColorBar | None:
+    """The one colour scale, from 0, of all shapes that are coloured by quality; None where there are none."""
+    values = [shape.attributes["quality"] for shape in shapes if shape.source(color) == "quality"]
+    if not values:
+        return None
+    return ColorBar((0, limit or max(typical_limit(quality) for quality in values)), label, colormap)
