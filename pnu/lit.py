@@ -140,8 +140,8 @@ class UpsamplingModule(pl.LightningModule):
         self.log_metrics("test", self.test_metrics)
 
     def log_metrics(self, stage: str, metrics: CloudMetrics) -> None:
-        # compute() has added up all processes already
-        self.log_dict({f"{stage}/{name}": value for name, value in metrics.compute().items()}, rank_zero_only=False)
+        # compute() has added up all processes; sync_dist then means over equal values
+        self.log_dict({f"{stage}/{name}": value for name, value in metrics.compute().items()}, sync_dist=True)
         metrics.reset()
 
     def configure_optimizers(self) -> OptimizerLRScheduler:

@@ -49,11 +49,13 @@ def composer(name: str, extra_folder: str | None = None) -> Iterator[Callable[..
         GlobalHydra.instance().hydra = before
 
 
-def compose_config(schema: type, overrides: Sequence[str] = (), name: str | None = None) -> Any:
+def compose_config(
+    schema: type, overrides: Sequence[str] = (), name: str | None = None, *, complete: bool = True
+) -> Any:
     """The checked config of a command, as its function gets it. For use from Python and in tests."""
     with composer(name or schema.__name__.lower()) as compose:
         check_keys(list(overrides), schema, compose)
-        return check(compose(list(overrides)), schema)
+        return check(compose(list(overrides)), schema, complete=complete)
 
 
 def parse(overrides: list[str]) -> list[Any]:
@@ -107,12 +109,19 @@ def check_keys(overrides: list[str], schema: type, compose: Callable[..., Any]) 
         if key not in known and key not in choices:
             nearest = nearest_key(key, [*known, *(choice for choice in choices if not choice.startswith("hydra/"))])
             raise ValueError(f"unknown key '{key}': did you mean '{nearest}'?")
+        if key in choices and not isinstance(override.value(), str | list | None):
+            raise ValueError(f"{key}={override.value()}: expected one of {', '.join(group_choices(key))}")
     chosen = [raw for raw, override in zip(overrides, parsed, strict=True) if override.key_or_group in choices]
     used = flatten(OmegaConf.to_container(compose(chosen)))
     for override in parsed:
         key = override.key_or_group
         if key not in choices and key not in used:
             raise ValueError(f"key '{key}' has no use with this {key.partition('.')[0]}: --help shows the keys that do")
+
+
+def group_choices(group: str) -> list[str]:
+    """What `group=...` may be."""
+    return sorted(path.stem for path in (config_folder() / group).glob("*.yaml"))
 
 
 def flatten(tree: Any, prefix: str = "") -> dict[str, Any]:

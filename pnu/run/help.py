@@ -4,7 +4,7 @@ import dataclasses
 import typing
 from typing import Any
 
-from pnu.run.config import config_folder
+from pnu.run.config import group_choices
 from pnu.run.schema import fields
 
 
@@ -29,7 +29,7 @@ def help_text(schema: type, program: str, cfg: Any) -> str:
             if name not in list(cfg) or name.startswith("_"):
                 continue
             if dataclasses.is_dataclass(hints[name]):
-                options = sorted(path.stem for path in (config_folder() / key.replace(".", "/")).glob("*.yaml"))
+                options = group_choices(key.replace(".", "/"))
                 choices = f" ({key}={'|'.join(options)})" if options else ""
                 lines.append(f"\n{field.metadata['doc']}{choices}")
                 describe(typing.cast(type, hints[name]), cfg[name] or {}, f"{key}.")

@@ -1,0 +1,210 @@
+"""The Lightning module, alone: what it logs, what stops it, what it optimizes."""
+
+import functools
+import math
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset
+
+from pnu.lit import TRAINER_OPTIONS, NonFinite, UpsamplingModule, quieten
+from pnu.losses import CompoundLoss
+from pnu.metrics import chamfer_sq
+
+
+class Spread(nn.Module):
+    """Four points around each input point, by a linear layer; small and fast."""
+
+    ratio, predicts_normals = 4, True
+
+    def __init__(self, columns: int = 6) -> None:
+        super().__init__()
+        self.predicts_normals = columns == 6
+        self.columns = columns
+        self.offsets = nn.Linear(6, 4 * columns)
+
+    def forward(self, patch: Tensor) -> Tensor:
+        offsets = 0.1 * self.offsets(patch).unflatten(-1, (4, self.columns))
+        return (patch[:, :, None, : self.columns] + offsets).flatten(1, 2)
+
+    def outputs(self, patch: Tensor) -> dict[str, Tensor]:
+        return {"prediction": self(patch)}
+
+
+class Spheres(Dataset):
+    """Points of the unit sphere with their normals; `broken`: index of a sample whose input holds a NaN."""
+
+    def __init__(self, length: int, broken: int | None = None) -> None:
+        self.length, self.broken = length, broken
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        generator = torch.Generator().manual_seed(index)
+        cloud = torch.randn(128, 3, generator=generator)
+        cloud = (cloud / cloud.norm(dim=1, keepdim=True)).repeat(1, 2)
+        sample = {"input": cloud[:32].clone(), "target": cloud, "index": index, "shape": "sphere"}
+        if index == self.broken:
+            sample["input"][0, 0] = math.nan
+        return sample
+
+
+class Record(pl.loggers.logger.DummyLogger):
+    def __init__(self) -> None:
+        super().__init__()
+        self.rows: list[tuple[int, dict[str, float]]] = []
+
+    def log_metrics(self, metrics: dict[str, float], step: int) -> None:
+        self.rows.append((step, metrics))
+
+    def steps(self, name: str) -> list[int]:
+        return [step for step, metrics in self.rows if name in metrics]
+
+    def values(self, name: str) -> list[float]:
+        return [metrics[name] for _, metrics in self.rows if name in metrics]
+
+
+def trainer(tmp_path: Path, logger: Any = False, **options: Any) -> pl.Trainer:
+    quieten()
+    options = {"accelerator": "cpu", "max_steps": 3, "log_every_n_steps": 1, **options}
+    return pl.Trainer(default_root_dir=tmp_path, logger=logger, **TRAINER_OPTIONS, **options)
+
+
+def module(columns: int = 6, **options: Any) -> UpsamplingModule:
+    torch.manual_seed(0)
+    adam = functools.partial(torch.optim.Adam, lr=1e-2)
+    return UpsamplingModule(Spread(columns), CompoundLoss(k=3), **{"optimizer": adam, **options})
+
+
+def loader(length: int = 6, **options: Any) -> DataLoader:
+    return DataLoader(Spheres(length, **options), batch_size=2)
+
+
+def test_every_term_every_step_and_every_metric(tmp_path: Path) -> None:
+    record = Record()
+    trainer(tmp_path, record).fit(module(), loader(), loader(4))
+    for name in ("cd", "point_knn", "normal", "normal_orth", "normal_knn", "loss", "lr", "gradient_norm"):
+        assert record.steps(f"train/{name}") == [0, 1, 2], name
+    for name in ("chamfer_sq", "hausdorff_sq", "spacing_cv", "normal_deg", "normal_unsigned_deg", "flipped"):
+        assert len(record.values(f"val/{name}")) == 1, name
+
+
+def test_logged_loss_is_the_weighted_sum(tmp_path: Path) -> None:
+    record = Record()
+    trainer(tmp_path, record).fit(module(), loader(), loader(2))
+    weights = {"cd": 1, "point_knn": 0.1, "normal": 0.05, "normal_orth": 1e-4, "normal_knn": 1e-4}
+    for i, loss in enumerate(record.values("train/loss")):
+        total = sum(weight * record.values(f"train/{name}")[i] for name, weight in weights.items())
+        assert loss == pytest.approx(total, rel=1e-5)
+
+
+def test_validation_is_the_mean_over_clouds_with_a_smaller_last_batch(tmp_path: Path) -> None:
+    lit = module()
+    (found,) = trainer(tmp_path).validate(lit, loader(5), verbose=False)
+    samples = [Spheres(5)[i] for i in range(5)]
+    with torch.no_grad():
+        values = [chamfer_sq(lit(s["input"][None])[0], s["target"]).item() for s in samples]
+    assert found["val/chamfer_sq"] == pytest.approx(sum(values) / 5, rel=1e-5)
+
+
+def test_training_lowers_the_loss(tmp_path: Path) -> None:
+    record = Record()
+    trainer(tmp_path, record, max_steps=60).fit(module(), loader(), loader(2))
+    values = record.values("train/loss")
+    assert values[-1] < 0.85 * values[0]
+
+
+def test_network_without_normals(tmp_path: Path) -> None:
+    record = Record()
+    trainer(tmp_path, record).fit(module(columns=3), loader(), loader(2))
+    assert not record.values("train/normal")
+    assert not record.values("val/normal_deg")
+    assert record.values("val/chamfer_sq")
+
+
+def test_nan_in_the_loss_stops_with_step_term_and_batch(tmp_path: Path) -> None:
+    class Broken(CompoundLoss):
+        calls = 0
+
+        def forward(self, *arguments: Any) -> dict[str, Tensor]:
+            terms = super().forward(*arguments)
+            Broken.calls += 1
+            if Broken.calls == 3:
+                terms["normal"] = terms["normal"] * math.nan
+                terms["loss"] = terms["loss"] + terms["normal"]
+            return terms
+
+    lit = module()
+    lit.loss = Broken(k=3)
+    with pytest.raises(NonFinite, match=r"step 2: normal is nan; the batch is in .*\.pt; a lower optimizer\.lr"):
+        trainer(tmp_path).fit(lit, loader(), loader(2))
+    (path,) = tmp_path.glob("nonfinite*.pt")
+    saved = torch.load(path, weights_only=True)
+    assert saved["step"] == 2
+    assert math.isnan(saved["terms"]["normal"])
+    assert math.isfinite(saved["terms"]["cd"])
+    assert torch.equal(saved["batch"]["input"], torch.stack([Spheres(6)[i]["input"] for i in (4, 5)]))
+    assert saved["batch"]["shape"] == ["sphere", "sphere"]
+
+
+def test_infinite_gradient_stops_before_it_reaches_the_weights(tmp_path: Path) -> None:
+    class Steep(CompoundLoss):
+        def forward(self, prediction: Tensor, *arguments: Any) -> dict[str, Tensor]:
+            terms = super().forward(prediction, *arguments)
+            terms["loss"] = terms["loss"] + (prediction - prediction.detach()).abs().sum().sqrt()  # 0, slope 1 / 0
+            return terms
+
+    lit = module()
+    lit.loss = Steep(k=3)
+    before = {name: value.clone() for name, value in lit.state_dict().items()}
+    with pytest.raises(NonFinite, match=r"step 0: gradient is (nan|inf)"):
+        trainer(tmp_path).fit(lit, loader(), loader(2))
+    assert all(torch.equal(before[name], value) for name, value in lit.state_dict().items())
+    assert torch.load(next(tmp_path.glob("nonfinite*.pt")), weights_only=True)["batch"]["input"].shape == (2, 32, 6)
+
+
+def test_finite_training_leaves_no_file(tmp_path: Path) -> None:
+    trainer(tmp_path).fit(module(), loader(), loader(2))
+    assert not list(tmp_path.glob("nonfinite*"))
+
+
+@pytest.mark.parametrize(
+    ("scheduler", "end"),
+    [
+        (functools.partial(torch.optim.lr_scheduler.CosineAnnealingLR, eta_min=0), 1.7e-4),
+        (functools.partial(torch.optim.lr_scheduler.OneCycleLR, max_lr=1e-2, pct_start=0.5, final_div_factor=10), 4e-5),
+        (functools.partial(torch.optim.lr_scheduler.StepLR, step_size=5, gamma=0.5), 2.5e-3),
+    ],
+)
+def test_schedule_spans_the_training_and_steps_with_it(scheduler: Any, end: float, tmp_path: Path) -> None:
+    record = Record()
+    lit = module(scheduler=scheduler)
+    trainer(tmp_path, record, max_steps=-1, max_epochs=4).fit(lit, loader(), loader(2))
+    rates = record.values("train/lr")
+    assert len(rates) == 12
+    assert rates[-1] == pytest.approx(end, rel=0.01)
+    assert max(rates) == pytest.approx(1e-2)
+
+
+def test_schedule_of_an_endless_training_is_refused(tmp_path: Path) -> None:
+    lit = module(scheduler=functools.partial(torch.optim.lr_scheduler.OneCycleLR, max_lr=1e-2))
+    with pytest.raises(ValueError, match=r"give trainer\.max_epochs or trainer\.max_steps"):
+        trainer(tmp_path, max_steps=-1, max_epochs=-1).fit(lit, loader(), loader(2))
+
+
+def test_two_processes_validate_like_one(tmp_path: Path) -> None:
+    """Metrics are sums over processes: two processes that see all clouds find the mean of one."""
+    (alone,) = trainer(tmp_path).validate(module(), loader(4), verbose=False)
+    (both,) = trainer(tmp_path, devices=2, strategy="ddp_fork").validate(module(), loader(4), verbose=False)
+    assert both == pytest.approx(alone, rel=1e-5)
+
+
+def test_mixed_precision_trains(tmp_path: Path) -> None:
+    record = Record()
+    trainer(tmp_path, record, precision="bf16-mixed").fit(module(), loader(), loader(2))
+    assert all(map(math.isfinite, record.values("train/loss")))
