@@ -248,3 +248,9 @@ def test_srgb_and_back() -> None:
 
 def test_normal_colours() -> None:
     np.testing.assert_array_equal(normal_colors(np.array([[1.0, 0, -1]])), [[255, 128, 0]])
+
+
+def test_parts_smaller_than_their_shadows_are_drawn() -> None:
+    small = Mesh(0.01 * octahedron().vertices + [0.5, 0.5, 0], octahedron().faces)
+    drawn = (render_mesh(small, camera=FRONT, size=600) < 255).any(2)
+    assert drawn.sum() == pytest.approx(2 * 3**2, abs=8)
