@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from pnu.io import Mesh
 from pnu.ops.colors import LMS, RGB, linear_light, normal_colors, srgb, value_colors
+from pnu.ops.mesh import corner_normals, split_creases
 from pnu.ops.spacing import spacing
 from pnu.pictures import Camera, ColorBar, figure, look_at, raster, render_cloud, render_mesh, save_png
 from pnu.pictures.figure import extent, ticks
@@ -47,7 +49,7 @@ def test_triangles_agree_with_every_pixel_against_every_triangle(monkeypatch: py
     corners = rng.uniform(-10, 50, (60, 3, 3))
     expected = slow_visible(corners, 40, 45)
     for chunk in (1 << 21, 50):  # in one go and in many small parts
-        monkeypatch.setattr(raster, "CHUNK", chunk)
+        monkeypatch.setattr("pnu.ops.chunks.CHUNK", chunk)
         found = raster.triangles(corners, 40, 45)
         picture = np.full(40 * 45, -1)
         picture[found.pixel] = found.primitive
@@ -112,15 +114,22 @@ def test_vertex_colours_are_interpolated() -> None:
 
 
 def test_sharp_edges_stay_sharp_and_gentle_ones_are_smoothed() -> None:
-    from pnu.pictures.render import corner_normals
-
     def roof(slope: float) -> np.ndarray:
         vertices = np.array([[-1.0, 0, -slope], [0, 0, 0], [0, 1, 0], [1, 0, -slope]])
-        return corner_normals(Mesh(vertices, np.array([[0, 1, 2], [1, 3, 2]])), True)
+        return corner_normals(Mesh(vertices, np.array([[0, 1, 2], [1, 3, 2]])))
 
     gentle, sharp = roof(0.1), roof(2.0)
     np.testing.assert_allclose(gentle[:, 1:3].reshape(-1, 3)[0], gentle[1, 0], atol=1e-12)
     assert (sharp[0, 1] * sharp[1, 0]).sum() == pytest.approx(-0.6)  # (-2, 0, 1) . (2, 0, 1) / 5
+
+
+def test_creases_are_split() -> None:
+    x, y, z = (c.ravel() for c in np.meshgrid([0.0, 1], [0.0, 1], [0.0, 1]))
+    hull = trimesh.PointCloud(np.stack([x, y, z], 1)).convex_hull
+    vertices, normals, faces = split_creases(Mesh(np.asarray(hull.vertices), np.asarray(hull.faces)))
+    assert len(vertices) == 24  # eight corners of a cube, three sides each
+    np.testing.assert_allclose(np.abs(normals).max(1), 1)
+    np.testing.assert_allclose(vertices[faces], hull.vertices[hull.faces])
 
 
 def test_cloud_shows_normals_as_colours_and_hides_the_far_side() -> None:

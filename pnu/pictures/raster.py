@@ -4,16 +4,15 @@ Coordinates in pixels: x right, y down, z (depth) towards the viewer; pixel (row
 (column + 1/2, row + 1/2).
 """
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pnu.ops.chunks import chunks, expand
+
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-CHUNK = 1 << 21  # fragments worked on at a time: bounds the memory
 
 
 class Fragments(NamedTuple):
@@ -37,19 +36,6 @@ class DepthBuffer:
     def fragments(self) -> Fragments:
         pixel = np.flatnonzero(self.key >= 0)
         return Fragments(pixel, self.key[pixel] & 0xFFFFFFFF)
-
-
-def expand(count: Index) -> tuple[Index, Index]:
-    """`count[i]` entries for each i: (owner, 0-based number within the owner)."""
-    owner = np.repeat(np.arange(len(count)), count)
-    return owner, np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
-
-
-def chunks(count: Index) -> list[slice]:
-    """Consecutive slices of the owners, each with about CHUNK entries in all (or one owner)."""
-    edges = np.searchsorted(np.cumsum(count), np.arange(CHUNK, count.sum() + CHUNK, CHUNK), side="left") + 1
-    edges = np.unique(np.concatenate([[0], np.minimum(edges, len(count))]))
-    return [slice(int(a), int(b)) for a, b in pairwise(edges)]
 
 
 def triangles(corners: Array, height: int, width: int) -> Fragments:

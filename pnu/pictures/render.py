@@ -6,6 +6,7 @@ from scipy.ndimage import minimum_filter
 
 from pnu.io import Mesh
 from pnu.ops.colors import normal_colors
+from pnu.ops.mesh import corner_normals
 from pnu.ops.spacing import spacing
 from pnu.pictures import raster, shading
 from pnu.pictures.camera import Camera
@@ -16,7 +17,6 @@ Image = NDArray[np.uint8]
 CLAY = (222, 224, 228)  # a surface without colours
 BACK = (214, 180, 160)  # the inside of a surface, seen through a hole or because it is inside out
 STONE = (130, 142, 160)  # points without colours and normals
-CREASE_DEG = 40.0  # edges sharper than this stay sharp under smooth shading
 
 
 def render_cloud(
@@ -142,31 +142,3 @@ def in_front(center: Array, radius: float, pixels: int) -> NDArray[np.bool_]:
     surface = minimum_filter(surface, footprint=reach[:, None] ** 2 + reach**2 <= radius**2, mode="nearest")
     column, row = np.clip(center[:, :2].astype(np.int64), 0, pixels - 1).T
     return center[:, 2] > surface[row, column] - radius / 2
-
-
-def corner_normals(mesh: Mesh, smooth: bool) -> Array:
-    """Unit normals `(f, 3, 3)` at the corners of each face; with `smooth` False, the face's own.
-
-    Smooth: the mean, weighted by area, over the faces around the vertex that make no sharp edge with this one.
-    """
-    corners = mesh.vertices[mesh.faces]
-    weighted = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    flat = weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-300)
-    if not smooth:
-        return np.repeat(flat[:, None], 3, 1)
-    vertex = mesh.faces.ravel()
-    by_vertex = np.argsort(vertex, kind="stable")
-    count = np.bincount(vertex, minlength=len(mesh.vertices))
-    first = np.cumsum(count) - count
-    total = np.zeros((len(vertex), 3))
-    for part in raster.chunks(count[vertex]):
-        corner, step = raster.expand(count[vertex[part]])
-        corner += part.start
-        other = by_vertex[first[vertex[corner]] + step] // 3
-        joined = (flat[corner // 3] * flat[other]).sum(1) > np.cos(np.radians(CREASE_DEG))
-        for k in range(3):
-            total[part, k] = np.bincount(
-                corner[joined] - part.start, weighted[other[joined], k], part.stop - part.start
-            )
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.where(length > 0, total / np.maximum(length, 1e-300), 0).reshape(-1, 3, 3)
