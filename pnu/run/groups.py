@@ -7,13 +7,42 @@ from pnu.run.schema import doc
 
 
 @dataclass
+class Augmentation:
+    """Random changes of training samples; a part with range or sigma 0 is off."""
+
+    rotation: bool = doc("turn input and target by a uniform random rotation")
+    scale: list[float] = doc("lowest and highest factor of input and target")
+    shift: float = doc("greatest offset of input and target along each axis, of the unit sphere's radius")
+    jitter_sigma: float = doc("standard deviation of each coordinate of the input's points")
+    jitter_clip: float = doc("greatest offset by jitter")
+    tilt_sigma: float = doc("standard deviation of the angles of the input's small rotation, in radians")
+    tilt_clip: float = doc("greatest of those angles")
+    input_probability: float = doc("of jitter, and of the small rotation")
+
+
+@dataclass
 class Data:
     """conf/data: patches to train, validate and test with."""
 
     _target_: str = doc("class of pnu.data")
-    seed: int = doc("of their order and augmentation")
+    path: str | None = doc("HDF5 file of patches (data=patches)")
+    root: str | None = doc("folder of meshes: ply, off, obj, stl (data=meshes)")
+    kinds: list[str] = doc("of procedural shapes: organic, cad (data=synthetic)")
+    patches: int = doc("cut from all shapes together")
+    cache: str = doc("folder of the files of patches that are cut")
+    shape_seed: int = doc("of where patches are cut and of their points")
+    quiet: bool = doc("no progress bar while patches are cut")
     batch_size: int = doc("patches of a training step, on each device")
     workers: int = doc("processes that load; the data are the same with any number")
+    seed: int = doc("of order, downsampling and augmentation")
+    input_points: int = doc("points of an input patch")
+    target_points: int = doc("points of a target patch; fewer than the file has take a smaller patch")
+    downsampling: str = doc("of target to input: nonuniform, random, poisson (evenly), given (the file's)")
+    strength: float = doc("nonuniform: centres are exp(strength) times denser than the farthest points; 0: uniform")
+    centers: int = doc("nonuniform: dense places of a patch")
+    val_share: float = doc("share of the shapes kept for validation")
+    test_share: float = doc("share of the shapes kept for the test")
+    augmentation: Augmentation = doc("Augmentation of training samples; null: none")
 
 
 @dataclass

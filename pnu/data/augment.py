@@ -1,0 +1,81 @@
+"""Augmentation of one training sample on the fly, as the paper and its released code have it."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pnu.ops.transforms import rotate, rotation_matrix, scale, small_rotation, translate
+
+
+class Augmentation:
+    """Random changes of a sample whose clouds lie in the unit sphere; normals turn with their points.
+
+    Input and target alike: rotation, scale, shift. The input alone, each with probability `input_probability`:
+    Gaussian jitter of the points, and a small rotation. Each part has its own switch: a range of zero width or sigma 0
+    (for the rotation, False).
+
+    Args:
+        rotation: turn by a uniform random rotation.
+        scale: lowest and highest factor.
+        shift: greatest offset along each axis.
+        jitter_sigma, jitter_clip: of the offset of each coordinate of each input point.
+        tilt_sigma, tilt_clip: of the three angles of the small rotation, in radians.
+        input_probability: of jitter, and of the small rotation.
+    """
+
+    def __init__(
+        self,
+        rotation: bool = True,
+        scale: tuple[float, float] = (0.9, 1.1),
+        shift: float = 0.1,
+        jitter_sigma: float = 0.025,
+        jitter_clip: float = 0.05,
+        tilt_sigma: float = 0.03,
+        tilt_clip: float = 0.09,
+        input_probability: float = 0.5,
+    ) -> None:
+        low, high = scale
+        if not 0 < low <= high:
+            raise ValueError(f"data.augmentation.scale: expected 0 < lowest <= highest, found {list(scale)}")
+        for name, value in {"shift": shift, "jitter_sigma": jitter_sigma, "jitter_clip": jitter_clip,
+                            "tilt_sigma": tilt_sigma, "tilt_clip": tilt_clip}.items():  # fmt: skip
+            if value < 0:
+                raise ValueError(f"data.augmentation.{name}: expected a number >= 0, found {value}")
+        if not 0 <= input_probability <= 1:
+            raise ValueError(f"data.augmentation.input_probability: expected 0 to 1, found {input_probability}")
+        self.rotation, self.scale, self.shift = rotation, (float(low), float(high)), shift
+        self.jitter_sigma, self.jitter_clip = jitter_sigma, jitter_clip
+        self.tilt_sigma, self.tilt_clip = tilt_sigma, tilt_clip
+        self.input_probability = input_probability
+
+    def __call__(self, clouds: Mapping[str, Tensor], generator: torch.Generator) -> dict[str, Tensor]:
+        """Clouds (1, n, 3 or 6) by name, "input" among them; all others are targets. The same keys, changed."""
+        # every number is drawn whatever the switches are, so that one switch does not change the other parts
+        rotation = rotation_matrix(1, generator=generator)
+        low, high = self.scale
+        factor = low + (high - low) * torch.rand(1, generator=generator)
+        offset = self.shift * (2 * torch.rand(1, 3, generator=generator) - 1)
+        changed = {}
+        for name, cloud in clouds.items():
+            if self.rotation:
+                cloud = rotate(cloud, rotation)
+            changed[name] = translate(scale(cloud, factor), offset)
+        changed["input"] = self.disturb(changed["input"], generator)
+        return changed
+
+    def disturb(self, cloud: Tensor, generator: torch.Generator) -> Tensor:
+        """Jitter and a small rotation about the origin, of the input alone."""
+        jittered, tilted = (torch.rand(2, generator=generator) < self.input_probability).tolist()
+        noise = torch.randn(cloud.shape[1], 3, generator=generator) * self.jitter_sigma
+        tilt = small_rotation(1, self.tilt_sigma, self.tilt_clip, generator=generator)
+        if jittered:
+            noise = noise.clamp(-self.jitter_clip, self.jitter_clip)
+            cloud = torch.cat([cloud[..., :3] + noise, cloud[..., 3:]], -1)
+        return rotate(cloud, tilt) if tilted else cloud
+
+
+def from_options(options: Mapping[str, Any] | None) -> Augmentation | None:
+    """The augmentation of a config group; None for none."""
+    return None if options is None else Augmentation(**options)

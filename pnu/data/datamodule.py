@@ -1,0 +1,231 @@
+"""The data of a training: patches from procedural shapes, from a folder of meshes, or from a file."""
+
+import functools
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+from torch.utils.data import DataLoader
+
+from pnu.data import shapes
+from pnu.data.augment import from_options
+from pnu.data.dataset import Downsampling, EpochSampler, Options, PatchDataset, check_options, split
+from pnu.data.patchset import build, check
+from pnu.io import Mesh, read_mesh
+
+MESH_SUFFIXES = (".ply", ".off", ".obj", ".stl")
+
+
+class PatchDataModule(pl.LightningDataModule):
+    """Patches of a file: python -m pnu.train data=patches data.path=FILE.
+
+    A batch holds "input" (B, input_points, 6) and "target" (B, target_points, 6), float32, in the unit sphere of each
+    input; "index" (B,), "shape" (list of B names) and, where the file has them, "edges" (B, e, 3) with rows of NaN.
+    Batches depend on the seed alone, not on the number of workers. Training goes on mid-epoch where a checkpoint was.
+
+    Args:
+        path: HDF5 file, see data/README.md.
+        batch_size: patches of a training step, in each process.
+        workers: processes that load; 0 loads in the training's own.
+        seed: of order, downsampling and augmentation.
+        input_points, target_points, downsampling, strength, centers: see `pnu.data.dataset.Options`.
+        augmentation: arguments of `pnu.data.augment.Augmentation`; None: none.
+        val_share, test_share: of the shapes, kept for validation and test.
+    """
+
+    def __init__(
+        self,
+        path: str | None = None,
+        *,
+        batch_size: int = 20,
+        workers: int = 0,
+        seed: int = 0,
+        input_points: int = 1024,
+        target_points: int = 4096,
+        downsampling: Downsampling = "nonuniform",
+        strength: float = 2.0,
+        centers: int = 3,
+        augmentation: Mapping[str, Any] | None = None,
+        val_share: float = 0.1,
+        test_share: float = 0.1,
+    ) -> None:
+        super().__init__()
+        if batch_size < 1 or workers < 0:
+            raise ValueError(f"data: expected batch_size >= 1 and workers >= 0, found {batch_size} and {workers}")
+        self.path, self.batch_size, self.workers, self.seed = path, batch_size, workers, seed
+        self.options = Options(input_points, target_points, downsampling, strength, centers)
+        self.augmentation = from_options(augmentation)
+        self.shares = {"val": val_share, "test": test_share}
+        self.resumed = 0, 1  # batches done, batches of an epoch
+        self.rows: dict[str, list[int]] | None = None
+
+    def patch_file(self) -> Path:
+        """The file of patches, made where it is not there yet."""
+        if self.path is None:
+            raise ValueError("data.path=FILE is required: an HDF5 file of patches, see data/README.md")
+        return Path(self.path)
+
+    def prepare_data(self) -> None:
+        self.patch_file()
+
+    def setup(self, stage: str | None = None) -> None:
+        if self.rows is not None:
+            return
+        self.file = self.patch_file()
+        check_options(self.file, self.options)
+        contents = check(self.file)
+        if contents.names is None:
+            print(f"{self.file} has no shape names: validation and test are its last blocks of consecutive patches")
+        self.names = contents.names
+        self.rows = split(contents.names, contents.patches, **self.shares, seed=0)
+        world = self.trainer.world_size if self.trainer else 1
+        if len(self.rows["train"]) < self.batch_size * world:
+            raise ValueError(
+                f"data.batch_size={self.batch_size}: expected at most the {len(self.rows['train'])} training patches"
+                f" of {self.file}" + (f" divided by {world} processes" if world > 1 else "")
+            )
+
+    def dataset(self, part: str) -> PatchDataset:
+        """The samples of "train", "val" or "test"."""
+        assert self.rows is not None
+        augmentation = self.augmentation if part == "train" else None
+        return PatchDataset(
+            self.file, self.rows[part], self.options, seed=self.seed if part == "train" else 0,
+            augmentation=augmentation, names=self.names,
+        )  # fmt: skip
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        rank, world = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+        data = self.dataset("train")
+        sampler = EpochSampler(len(data), self.batch_size, seed=self.seed, rank=rank, world=world)
+        done, per_epoch = self.resumed
+        sampler.start_at(done // per_epoch, done % per_epoch)
+        return self.loader(data, sampler=sampler)
+
+    def val_dataloader(self) -> DataLoader[Any]:
+        return self.evaluation_loader("val")
+
+    def test_dataloader(self) -> DataLoader[Any]:
+        return self.evaluation_loader("test")
+
+    def evaluation_loader(self, part: str) -> DataLoader[Any]:
+        data = self.dataset(part)
+        if self.trainer and self.trainer.world_size > 1:
+            data.rows = data.rows[self.trainer.global_rank :: self.trainer.world_size]
+        return self.loader(data)
+
+    def loader(self, data: PatchDataset, **options: Any) -> DataLoader[Any]:
+        # spawned workers: a fork of a process with threads may hang
+        context = "spawn" if self.workers else None
+        return DataLoader(
+            data, self.batch_size, num_workers=self.workers, multiprocessing_context=context,
+            persistent_workers=self.workers > 0, **options,
+        )  # fmt: skip
+
+    def state_dict(self) -> dict[str, Any]:
+        assert self.trainer is not None
+        progress: Any = self.trainer.fit_loop.epoch_loop.batch_progress.total
+        return {"batches": progress.processed, "per_epoch": int(self.trainer.num_training_batches)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.resumed = int(state_dict["batches"]), max(1, int(state_dict["per_epoch"]))
+
+
+class GeneratedDataModule(PatchDataModule):
+    """Patches that are cut from meshes once and kept in a file, whose name holds a hash of all that it depends on.
+
+    Args:
+        patches: of all shapes together, training, validation and test.
+        cache: folder of the file.
+        shape_seed: of the patches' places and points.
+        options: as for `PatchDataModule`.
+    """
+
+    def __init__(
+        self, *, patches: int = 4000, cache: str = "data", shape_seed: int = 0, quiet: bool = False, **options: Any
+    ) -> None:
+        super().__init__(**options)
+        self.patches, self.cache, self.shape_seed, self.quiet = patches, Path(cache), shape_seed, quiet
+
+    def makers(self) -> dict[str, Callable[[], Mesh]]:
+        """Functions that make the meshes, by name."""
+        raise NotImplementedError
+
+    def parameters(self) -> dict[str, Any]:
+        """All that the patches depend on."""
+        raise NotImplementedError
+
+    def patch_file(self) -> Path:
+        parameters = self.parameters() | {"patches": self.patches, "seed": self.shape_seed, "schema": 1}
+        digest = hashlib.sha256(json.dumps(parameters, sort_keys=True).encode()).hexdigest()[:12]
+        path = self.cache / f"{parameters['source']}_{self.patches}_{digest}.h5"
+        if not path.exists():
+            processes = min(
+                len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 8
+            )
+            build(
+                path, self.makers(), self.patches, seed=self.shape_seed, parameters=parameters, processes=processes,
+                progress=None if self.quiet else functools.partial(bar, description=f"cut patches into {path}"),
+            )  # fmt: skip
+        return path
+
+
+def bar(results: Iterable[Any], total: int, description: str) -> Iterable[Any]:
+    from rich.progress import track
+
+    return track(results, description, total)
+
+
+class SyntheticDataModule(GeneratedDataModule):
+    """Patches of the procedural shapes that come with pnu: python -m pnu.train data=synthetic.
+
+    Args:
+        kinds: of shapes, "organic" and "cad".
+        options: as for `GeneratedDataModule` and `PatchDataModule`.
+    """
+
+    def __init__(self, *, kinds: Iterable[str] = ("organic", "cad"), **options: Any) -> None:
+        super().__init__(**options)
+        self.kinds = list(kinds)
+
+    def makers(self) -> dict[str, Callable[[], Mesh]]:
+        return {name: functools.partial(shapes.make, name) for name in shapes.names(*self.kinds)}
+
+    def parameters(self) -> dict[str, Any]:
+        return {"source": "synthetic", "shapes": shapes.names(*self.kinds), "version": shapes.VERSION}
+
+
+class MeshDataModule(GeneratedDataModule):
+    """Patches of a folder of meshes (ply, off, obj, stl): python -m pnu.train data=meshes data.root=FOLDER.
+
+    Args:
+        root: the folder; its subfolders count too.
+        options: as for `GeneratedDataModule` and `PatchDataModule`.
+    """
+
+    def __init__(self, root: str | None = None, **options: Any) -> None:
+        super().__init__(**options)
+        self.root = root
+
+    @functools.cached_property
+    def files(self) -> dict[str, Path]:
+        if self.root is None:
+            raise ValueError("data.root=FOLDER is required: a folder of meshes (ply, off, obj, stl)")
+        root = Path(self.root)
+        if not root.is_dir():
+            raise ValueError(f"data.root={root}: no such folder; expected one with meshes (ply, off, obj, stl)")
+        found = sorted(path for path in root.rglob("*") if path.suffix.lower() in MESH_SUFFIXES)
+        if not found:
+            raise ValueError(f"data.root={root}: expected meshes (ply, off, obj, stl), found none")
+        return {path.relative_to(root).with_suffix("").as_posix().replace("/", "_"): path for path in found}
+
+    def makers(self) -> dict[str, Callable[[], Mesh]]:
+        return {name: functools.partial(read_mesh, path) for name, path in self.files.items()}
+
+    def parameters(self) -> dict[str, Any]:
+        hashes = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in self.files.items()}
+        return {"source": "meshes", "shapes": hashes}

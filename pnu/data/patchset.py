@@ -1,0 +1,206 @@
+"""Patch files: HDF5 with dense patches of meshes. Schema in data/README.md; PU-Net's own file has the same one."""
+
+import json
+import multiprocessing
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pnu.data.shapes import unit
+from pnu.io import Mesh, atomic_path
+from pnu.ops.edges import sharp_edge_points
+from pnu.ops.sampling import farthest_points_large
+from pnu.ops.surface import sample_poisson_disk
+
+PATCH_POINTS = 4096
+EDGE_POINTS = 256
+SHARE = (0.1, 0.3)  # of its shape that a patch covers, smallest and largest
+
+
+class Patches(NamedTuple):
+    """Patches of one shape."""
+
+    clouds: np.ndarray  # (p, 4096, 6) float32, points in the frame of the shape and unit normals
+    edges: np.ndarray  # (p, 256, 3) float32, points on the sharp edges near the patch, NaN where there are fewer
+
+
+def cut_patches(mesh: Mesh, count: int, rng: np.random.Generator) -> Patches:
+    """Patches of 4096 evenly spread points: centres by farthest points, the nearest points of each by distance, as at
+    inference. Half of them cover the largest share of the shape, half the smallest: of two samplings, one sparser."""
+    clouds, edges = [], []
+    sharp = sharp_edge_points(mesh, spacing=0.01)
+    for share, part in zip(SHARE[::-1], (count - count // 2, count // 2), strict=True):
+        if not part:
+            continue
+        dense = sample_poisson_disk(mesh, round(PATCH_POINTS / share), rng).astype(np.float32)
+        centers = dense[farthest_points_large(dense[:, :3], part), :3]
+        idx = cKDTree(dense[:, :3]).query(centers, PATCH_POINTS)[1]
+        clouds.append(dense[idx])
+        edges.append(np.stack([edges_of(patch, sharp, rng) for patch in clouds[-1]]))
+    return Patches(np.concatenate(clouds), np.concatenate(edges))
+
+
+def edges_of(patch: np.ndarray, sharp: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """(256, 3): those of the points on sharp edges that a patch reaches, rows of NaN where there are fewer."""
+    chosen = np.full((EDGE_POINTS, 3), np.nan, np.float32)
+    if len(sharp):
+        tree = cKDTree(patch[:, :3])
+        spacing = np.median(tree.query(patch[::16, :3], 2)[0][:, 1])
+        near = sharp[tree.query(sharp, distance_upper_bound=2 * spacing)[0] < np.inf]
+        kept = near if len(near) <= EDGE_POINTS else near[rng.permutation(len(near))[:EDGE_POINTS]]
+        chosen[: len(kept)] = kept
+    return chosen
+
+
+def build(
+    path: str | Path,
+    shapes: Mapping[str, Callable[[], Mesh]],
+    patches: int,
+    *,
+    seed: int = 0,
+    parameters: Mapping[str, Any] | None = None,
+    processes: int = 1,
+    progress: Callable[[Iterable[Any], int], Iterable[Any]] | None = None,
+) -> None:
+    """Write a patch file, whole or not at all; the same arguments give the same patches with any number of processes.
+
+    Args:
+        shapes: functions that make the meshes, by name.
+        patches: of all shapes together, at least one each.
+        parameters: kept in the file, so that it can be told from one made otherwise.
+        progress: wraps the iterable over shapes, whose length it gets too.
+    """
+    if not shapes:
+        raise ValueError("shapes: expected at least one, found none")
+    if patches < len(shapes):
+        raise ValueError(f"data.patches: expected at least one for each of the {len(shapes)} shapes, found {patches}")
+    names = sorted(shapes)
+    counts = [patches // len(names) + (i < patches % len(names)) for i in range(len(names))]
+    jobs = [(name, shapes[name], count, seed) for name, count in zip(names, counts, strict=True)]
+    text = h5py.string_dtype()
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs["parameters"] = json.dumps(dict(parameters or {}), sort_keys=True)
+        clouds = file.create_dataset("poisson_4096", (patches, PATCH_POINTS, 6), "f4", chunks=(1, PATCH_POINTS, 6))
+        edges = file.create_dataset("edges", (patches, EDGE_POINTS, 3), "f4", chunks=(16, EDGE_POINTS, 3))
+        name_of = file.create_dataset("name", (patches,), text)
+        row = 0
+        results: Iterable[Any] = results_of(jobs, processes)
+        for name, made in progress(results, len(jobs)) if progress else results:
+            rows = slice(row, row + len(made.clouds))
+            clouds[rows], edges[rows], name_of[rows] = made.clouds, made.edges, name
+            row = rows.stop
+
+
+def results_of(jobs: list[tuple[str, Callable[[], Mesh], int, int]], processes: int) -> Iterable[tuple[str, Patches]]:
+    if processes <= 1:
+        yield from map(job, jobs)
+        return
+    with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
+        yield from pool.map(job, jobs)
+
+
+def job(arguments: tuple[str, Callable[[], Mesh], int, int]) -> tuple[str, Patches]:
+    """The patches of one shape, whose randomness comes from the seed and its name alone."""
+    name, make, count, seed = arguments
+    rng = np.random.default_rng([seed, *name.encode()])
+    try:
+        return name, cut_patches(unit(make()), count, rng)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
+
+
+class Contents(NamedTuple):
+    """What a patch file holds."""
+
+    patches: int
+    points: int
+    names: list[str] | None  # shape of each patch
+    has_edges: bool
+    has_input: bool  # montecarlo_1024
+    parameters: dict[str, Any]
+
+
+def check(path: str | Path) -> Contents:
+    """What a patch file holds.
+
+    Raises:
+        ValueError: no such file, no HDF5, or it lacks what training needs; the message says what.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file; expected an HDF5 file of patches as data/README.md describes")
+    try:
+        file = h5py.File(path, "r")
+    except OSError:
+        raise ValueError(f"{path}: expected an HDF5 file of patches, found something else or a damaged file") from None
+    with file:
+        clouds = file.get("poisson_4096")
+        if not isinstance(clouds, h5py.Dataset):
+            raise ValueError(f"{path}: lacks the dataset poisson_4096 (patches, points, 6); it has {listing(file)}")
+        if clouds.ndim != 3 or clouds.shape[2] != 6 or clouds.shape[0] < 1 or clouds.shape[1] < 64:
+            raise ValueError(
+                f"{path}: poisson_4096 must have shape (patches, 64 or more points, 6), found {clouds.shape}"
+            )
+        if clouds.dtype.kind != "f":
+            raise ValueError(f"{path}: poisson_4096 must hold floating-point numbers, found {clouds.dtype}")
+        sample = clouds[:: max(1, len(clouds) // 8)]
+        if not np.isfinite(sample).all():
+            raise ValueError(f"{path}: poisson_4096 holds NaN or infinity")
+        length = np.linalg.norm(sample[..., 3:], axis=-1)
+        if not (np.abs(length - 1) < 0.01).mean() > 0.99:
+            raise ValueError(
+                f"{path}: columns 4 to 6 of poisson_4096 must be unit normals, found lengths {length.min():.3g} to"
+                f" {length.max():.3g}"
+            )
+        names = names_of(path, file, len(clouds))
+        given = file.get("montecarlo_1024")
+        if given is not None and (given.ndim != 3 or given.shape[0] != clouds.shape[0] or given.shape[2] != 6):
+            raise ValueError(f"{path}: montecarlo_1024 must have shape ({len(clouds)}, points, 6), found {given.shape}")
+        edges = file.get("edges")
+        if edges is not None and (edges.ndim != 3 or edges.shape[0] != clouds.shape[0] or edges.shape[2] != 3):
+            raise ValueError(f"{path}: edges must have shape ({len(clouds)}, points, 3), found {edges.shape}")
+        parameters = json.loads(file.attrs.get("parameters", "{}"))
+        return Contents(clouds.shape[0], clouds.shape[1], names, edges is not None, given is not None, parameters)
+
+
+def listing(file: h5py.File) -> str:
+    return ", ".join(f"{name} {getattr(item, 'shape', 'group')}" for name, item in file.items()) or "nothing"
+
+
+def names_of(path: Path, file: h5py.File, patches: int) -> list[str] | None:
+    names = file.get("name")
+    if names is None:
+        return None
+    if names.shape not in ((patches,), (patches, 1)):
+        raise ValueError(f"{path}: name must have one entry for each of the {patches} patches, found {names.shape}")
+    values = names[()].reshape(-1)
+    return [value.decode(errors="replace") if isinstance(value, bytes) else str(value) for value in values]
+
+
+def describe(path: str | Path) -> dict[str, Any]:
+    """Figures of a patch file: patches, shapes, points, median spacing and extent of a patch, edges, parameters."""
+    contents = check(path)
+    with h5py.File(path, "r") as file:
+        clouds = file["poisson_4096"]
+        sample = clouds[:: max(1, len(clouds) // 32)]
+        spacing = [np.median(cKDTree(cloud[:, :3]).query(cloud[:, :3], 2)[0][:, 1]) for cloud in sample]
+        radius = [np.linalg.norm(cloud[:, :3] - cloud[:, :3].mean(0), axis=1).max() for cloud in sample]
+        sharp = float(np.isfinite(file["edges"][:, 0, 0]).mean()) if contents.has_edges else None
+    return {
+        "file": str(path),
+        "size_MB": round(Path(path).stat().st_size / 1e6, 1),
+        "patches": contents.patches,
+        "points": contents.points,
+        "shapes": len(set(contents.names)) if contents.names else None,
+        "spacing_over_radius": float(np.median(np.array(spacing) / np.array(radius))),
+        "radius_median": float(np.median(radius)),
+        "share_with_sharp_edges": sharp,
+        "montecarlo_1024": contents.has_input,
+        "parameters": contents.parameters,
+    }
