@@ -15,9 +15,9 @@ ABSTRACTIONS = ((6, 32, 32, 64), (67, 64, 64, 128), (131, 128, 128, 256), (259, 
 PROPAGATIONS = ((768, 128, 256), (384, 128, 128), (192, 128, 128), (134, 128, 256))  # coarsest first
 
 
-def squared_distances(a: Tensor, b: Tensor) -> Tensor:
-    """All squared distances of `a` (B, n, 3) to `b` (B, m, 3), as (B, n, m)."""
-    return (a[:, :, None] - b[:, None]).square().sum(-1)
+def distances(a: Tensor, b: Tensor) -> Tensor:
+    """The full matrix (B, n, m) of distances of `a` (B, n, 3) to `b` (B, m, 3)."""
+    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 def farthest_points(points: Tensor, m: int) -> Tensor:
@@ -97,8 +97,8 @@ class Propagation(nn.Module):
         self.mlp = convolutions(widths)
 
     def forward(self, fine: Tensor, coarse: Tensor, skip: Tensor, features: Tensor) -> Tensor:
-        distance_sq, idx = squared_distances(fine, coarse).topk(min(3, coarse.shape[1]), largest=False)
-        weight = 1 / (distance_sq.sqrt() + 1e-8)
+        distance, idx = distances(fine, coarse).topk(min(3, coarse.shape[1]), largest=False)
+        weight = 1 / (distance + 1e-8)
         weight = weight / weight.sum(-1, keepdim=True)
         interpolated = (gather(features, idx) * weight[:, None]).sum(-1)
         return self.mlp(torch.cat([interpolated, skip], 1)[..., None]).squeeze(-1)
@@ -144,3 +144,35 @@ class PlainPNU(nn.Module):
             local = propagation(points[level], points[level + 1], features[level], local)
         global_ = self.GLOBAL_module(x).max(-1, keepdim=True).values.expand(-1, -1, n)
         return self.UPSAMPLING_module(torch.cat([x, local, global_], 1)).mT
+
+
+class PlainLoss(nn.Module):
+    """The released compound loss by full distance matrices."""
+
+    def __init__(self, weights: tuple[float, ...] = (1.0, 0.1, 0.05, 1e-4, 1e-4), k: int = 15) -> None:
+        super().__init__()
+        self.weights, self.k = weights, k
+
+    def forward(self, prediction: Tensor, target: Tensor) -> dict[str, Tensor]:
+        points, normals = prediction[..., :3].mT, prediction[..., 3:].mT  # (B, 3, m)
+        true_points, true_normals = target[..., :3].mT, target[..., 3:].mT
+        with torch.no_grad():
+            matrix = distances(target[..., :3], prediction[..., :3])
+            to_prediction, to_target = matrix.argmin(2), matrix.argmin(1)
+            idx = distances(prediction[..., :3], prediction[..., :3]).topk(self.k + 1, largest=False).indices[..., 1:]
+
+        def nearest(values: Tensor, idx: Tensor) -> Tensor:
+            return gather(values, idx[..., None])[..., 0]
+
+        to_target_sq = (points - nearest(true_points, to_target)).square().sum(1)
+        to_prediction_sq = (true_points - nearest(points, to_prediction)).square().sum(1)
+        offsets = points[..., None] - gather(points, idx)  # (B, 3, m, k)
+        cosine = torch.cosine_similarity(offsets, normals[..., None].expand_as(offsets), dim=1)
+        terms = {
+            "cd": to_target_sq.mean() + to_prediction_sq.mean(),
+            "point_knn": offsets.square().sum(1).mean(),
+            "normal": (true_normals - nearest(normals, to_prediction)).square().sum(1).mean(),
+            "normal_orth": cosine.abs().mean(),
+            "normal_knn": (normals[..., None] - gather(normals, idx)).square().sum(1).mean(),
+        }
+        return {**terms, "loss": torch.stack([w * v for w, v in zip(self.weights, terms.values(), strict=True)]).sum()}

@@ -2,13 +2,17 @@
 
 import itertools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pnu.ops.grouping import gather, interpolate
-from pnu.ops.nearest import ball_query
+from pnu.models import stack
+from pnu.models.neighborhoods import Groups, distinct, pool, single
+from pnu.ops.combine import combine
+from pnu.ops.grouping import gather
+from pnu.ops.nearest import ball_query, knn
 from pnu.ops.sampling import farthest_points
 
 
@@ -18,6 +22,9 @@ class Layer(nn.Module):
     Without bias it is initialised as in PointNet++ (Kaiming, normal), else as a convolution of torch, both as released.
     """
 
+    linear: nn.Linear
+    norm: nn.BatchNorm1d
+
     def __init__(self, width_in: int, width_out: int, *, bias: bool = True) -> None:
         super().__init__()
         self.linear = nn.Linear(width_in, width_out, bias=bias)
@@ -25,19 +32,52 @@ class Layer(nn.Module):
         if not bias:
             nn.init.kaiming_normal_(self.linear.weight)
 
-    def forward(self, x: Tensor) -> Tensor:
-        return self.activate(self.linear(x))
-
-    def activate(self, x: Tensor) -> Tensor:
-        """Batch norm and ReLU alone, for inputs that were multiplied elsewhere."""
-        return self.norm(x.flatten(0, -2)).relu().view(x.shape)
+    def forward(self, x: Tensor, *, projected: bool = False) -> Tensor:
+        """With `projected`, x holds the products with the weight, without bias."""
+        rows = x.flatten(0, -2)
+        if not projected:
+            rows = self.linear(rows)
+        elif self.linear.bias is not None:
+            rows = rows + self.linear.bias
+        return self.norm(rows).relu().view(*x.shape[:-1], -1)
 
 
 class MLP(nn.Sequential):
-    """Layers of the given widths, the input's first."""
+    """Layers of the given widths, the input's first: (..., widths[0]) -> (..., widths[-1])."""
 
     def __init__(self, widths: Sequence[int], *, bias: bool = True) -> None:
         super().__init__(*(Layer(*pair, bias=bias) for pair in itertools.pairwise(widths)))
+
+    def forward(self, x: Tensor, *, projected: bool = False, groups: Groups | None = None) -> Tensor:
+        """Rows (..., C) through all layers.
+
+        Args:
+            projected: x already holds the products of the first layer's weight, without bias.
+            groups: x is (R, C) and the output the maximum over groups of rows, (G, C').
+        """
+        rows = x.reshape(-1, x.shape[-1])
+        if streamed(x, self.training):
+            run = stack.train if self.training else stack.infer
+            rows = run(rows, self.layers, projected=projected, groups=groups)
+        else:
+            for i, layer in enumerate(self.layers):
+                rows = layer(rows, projected=projected and i == 0)
+            rows = rows if groups is None else pool(rows, groups)
+        return rows if groups is not None else rows.view(*x.shape[:-1], rows.shape[-1])
+
+    @property
+    def layers(self) -> list[Layer]:
+        return cast(list[Layer], list(self))
+
+    def first_weight(self, split: int) -> tuple[Tensor, Tensor]:
+        """Weight of the first layer for the first `split` columns of its input, and for the others."""
+        weight = self.layers[0].linear.weight
+        return weight[:, :split], weight[:, split:]
+
+
+def streamed(x: Tensor, training: bool) -> bool:
+    """Whether layers run chunk by chunk (`stack`): on the CPU, except for gradients in eval mode."""
+    return x.device.type == "cpu" and (training or not torch.is_grad_enabled())
 
 
 class Level(NamedTuple):
@@ -64,7 +104,10 @@ def hierarchy(points: Tensor, radii: Sequence[float], k: int) -> list[Level]:
 
 
 class Abstraction(nn.Module):
-    """Set abstraction of PointNet++: shared MLP over [offset, feature] of the neighbours, then their maximum."""
+    """Set abstraction of PointNet++: shared MLP over [offset, feature] of the neighbours, then their maximum.
+
+    The first layer is linear in both, so features are multiplied once a point, before they are gathered.
+    """
 
     def __init__(self, widths: Sequence[int]) -> None:
         super().__init__()
@@ -72,21 +115,41 @@ class Abstraction(nn.Module):
 
     def forward(self, points: Tensor, features: Tensor, level: Level) -> Tensor:
         """Features (B, n, C) at points (B, n, 3), pooled over the neighbourhoods of a level: (B, m, C')."""
-        offsets = gather(points, level.neighbors) - level.points[:, :, None]
-        return self.mlp(torch.cat([offsets, gather(features, level.neighbors)], -1)).amax(2)
+        clouds, m, _ = level.neighbors.shape
+        n = points.shape[1]
+        groups = (distinct if streamed(points, self.training) else single)(level.neighbors, n)
+        offsets = points.reshape(-1, 3)[groups.source] - level.points.reshape(-1, 3)[groups.owner]
+        flat = features.reshape(clouds * n, -1)
+        if not features.requires_grad and flat.shape[1] <= 3:
+            rows = torch.cat([offsets, flat[groups.source]], -1)
+            return self.mlp(rows, groups=groups).view(clouds, m, -1)
+        of_offsets, of_features = self.mlp.first_weight(3)
+        rows = torch.addmm(combine(F.linear(flat, of_features), groups.source[:, None]), offsets, of_offsets.t())
+        return self.mlp(rows, projected=True, groups=groups).view(clouds, m, -1)
 
 
 class Propagation(nn.Module):
-    """Feature propagation of PointNet++: interpolation from 3 coarse points, skip features, shared MLP."""
+    """Feature propagation of PointNet++: interpolation from 3 coarse points, skip features, shared MLP.
+
+    Interpolation and the first layer are linear: features are multiplied at the coarse points, then interpolated.
+    """
 
     def __init__(self, coarse: int, skip: int, *widths: int) -> None:
         super().__init__()
+        self.coarse = coarse
         self.mlp = MLP((coarse + skip, *widths), bias=False)
 
     def forward(self, fine_points: Tensor, coarse_points: Tensor, skip: Tensor, features: Tensor) -> Tensor:
         """Features (B, m, C) at coarse points (B, m, 3), carried to fine points (B, n, 3): (B, n, C')."""
-        k = min(3, coarse_points.shape[1])
-        return self.mlp(torch.cat([interpolate(features, coarse_points, fine_points, k), skip], -1))
+        clouds, m, _ = coarse_points.shape
+        dist_sq, idx = knn(fine_points, coarse_points, min(3, m))
+        inverse = 1 / (dist_sq.sqrt() + 1e-8)
+        inverse = inverse / inverse.sum(-1, keepdim=True)
+        idx = idx + torch.arange(clouds, device=idx.device).view(-1, 1, 1) * m
+        of_features, of_skip = self.mlp.first_weight(self.coarse)
+        rows = combine(F.linear(features.flatten(0, 1), of_features), idx.flatten(0, 1), inverse.flatten(0, 1))
+        rows = torch.addmm(rows, skip.flatten(0, 1), of_skip.t())
+        return self.mlp(rows, projected=True).view(clouds, fine_points.shape[1], -1)
 
 
 def expand(features: Tensor) -> Tensor:

@@ -3,9 +3,11 @@
 from typing import ClassVar
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pnu.models.layers import MLP, Abstraction, Propagation, expand, hierarchy
+from pnu.models.neighborhoods import whole
 
 RADII = (0.1, 0.2, 0.3, 0.4)
 NEIGHBORS = 32
@@ -93,12 +95,13 @@ class PNU(nn.Module):
         if columns < self.channels or n < MINIMUM:
             raise ValueError(f"patch: expected (B, n >= {MINIMUM}, {self.channels}), got {tuple(patch.shape)}")
         x = patch[..., : self.channels].contiguous()
-        parts = [x]
-        if self.local_features is not None:
-            parts.append(self.local_features(x))
+        each = x if self.local_features is None else torch.cat([x, self.local_features(x)], -1)
+        # the first layer of the head is linear: its part for the global features is computed once a patch
+        of_each, of_patch = self.head.first_weight(each.shape[-1])
+        rows = F.linear(each, of_each)
         if self.global_features is not None:
-            parts.append(self.global_features(x).amax(1, keepdim=True).expand(-1, n, -1))
-        features = self.head(torch.cat(parts, -1))
+            rows += F.linear(self.global_features(x.flatten(0, 1), groups=whole(batch, n)), of_patch)[:, None]
+        features = self.head(rows, projected=True)
         for mlp in self.expansions:
             features = mlp(expand(features))
         points = self.regression(features)
