@@ -118,6 +118,7 @@ class _Stack(torch.autograd.Function):
         for i in reversed(range(depth)):
             norm = norms[i]
             sign = ctx.sign if i == depth - 1 else None
+            assert kept is not None  # wanted in every layer but the first
             d_shifts.append(sums[0])
             d_scales.append(sums[1] * norm.inverse_deviation * (1 if sign is None else sign))
             products = _Gradient(
