@@ -16,7 +16,7 @@ LAYERS = [
     {"pnu.data"},
     {"pnu.models", "pnu.losses", "pnu.metrics"},
     {"pnu.checkpoint"},
-    {"pnu.inference", "pnu.surfaces", "pnu.pictures", "pnu.classical"},
+    {"pnu.inference", "pnu.surfaces", "pnu.pictures", "pnu.page", "pnu.classical"},
     {"pnu.evaluation"},
     {"pnu.run", "pnu.schema"},
     {"pnu.lit", "pnu.callbacks"},

@@ -23,11 +23,14 @@ class Fragments(NamedTuple):
 
 
 class DepthBuffer:
-    """Keeps, for each of `count` pixels, the primitive that is nearest to the viewer; depths lie in `low`..`high`."""
+    """Keeps, for each of `count` pixels, the primitive nearest to the viewer; of equal ones, the highest number.
+
+    Depths lie in `low`..`high`; a 16-millionth of that range is told apart.
+    """
 
     def __init__(self, count: int, low: float, high: float) -> None:
         self.key = np.full(count, -1, np.int64)
-        self.low, self.steps = low, (2**31 - 1) / ((high - low) or 1.0)
+        self.low, self.steps = low, 2**24 / ((high - low) or 1.0)
 
     def add(self, pixel: Index, depth: Array, primitive: Index) -> None:
         steps = ((depth - self.low) * self.steps).astype(np.int64)

@@ -80,12 +80,14 @@ def render_mesh(
         )
     pixels = size * supersample
     corners = project(camera, vertices, pixels)[faces]
-    found = raster.triangles(corners, pixels, pixels)
-    face = found.primitive
+    (ax, ay), (bx, by) = ((corners[:, i] - corners[:, 0]).T[:2] for i in (1, 2))
+    back = ax * by - ay * bx > 0  # y grows downwards: a face seen from outside turns clockwise
+    order = np.argsort(~back, kind="stable")  # where a fold has two faces at one depth, the one that looks here is seen
+    found = raster.triangles(corners[order], pixels, pixels)
+    face = order[found.primitive]
     weight = raster.barycentric(corners[face], pixel_middle(found.pixel, pixels))[:, :, None]
     normal = (weight * (corner_normals(mesh, smooth) @ camera.rotation.T)[face]).sum(1)
-    (ax, ay), (bx, by) = ((corners[:, i] - corners[:, 0]).T[:2] for i in (1, 2))
-    inside = (ax * by - ay * bx > 0)[face, None]  # y grows downwards: a face seen from outside turns clockwise
+    inside = back[face, None]
     normal = np.where(inside, -normal, normal)
     if vertex_colors is None:
         color = np.where(inside, BACK, CLAY) / 255

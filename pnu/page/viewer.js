@@ -1,0 +1,245 @@
+// The 3D views: one canvas, one camera; clouds and surfaces of one shape alone or side by side.
+"use strict";
+
+const $ = (selector, root = document) => root.querySelector(selector);
+const views = JSON.parse($("#views").textContent);
+const colors = JSON.parse($("#colors").textContent);
+const RANGE = 1.25; // positions are stored as 0..65535 over -RANGE..RANGE, in units of the true radius
+const MODES = { normals: 0, errors: 1, plain: 2 };
+
+const VERTEX = `#version 300 es
+in vec3 position;
+in vec3 normal;
+in float error;
+uniform mat4 modelViewMatrix, projectionMatrix;
+uniform mat3 normalMatrix;
+uniform vec4 uCell; // scale and shift of the picture's part that this drawing has
+uniform float uPixels, uRadius;
+out vec3 vNormal, vView, vObject;
+out float vError;
+void main() {
+  vec4 view = modelViewMatrix * vec4((position * 2.0 - 1.0) * ${RANGE}, 1.0);
+  vNormal = normalMatrix * normal;
+  vObject = normal;
+  vView = view.xyz;
+  vError = error;
+  gl_Position = projectionMatrix * view;
+  gl_PointSize = max(uRadius * uPixels * projectionMatrix[1][1] / gl_Position.w, 2.0);
+  gl_Position.xy = gl_Position.xy * uCell.xy + uCell.zw * gl_Position.w;
+}`;
+
+const FRAGMENT = `#version 300 es
+precision highp float;
+in vec3 vNormal, vView, vObject;
+in float vError;
+uniform int uMode, uMesh;
+uniform vec3 uColors[16];
+out vec4 color;
+vec3 errorColor(float t) {
+  float x = clamp(t, 0.0, 1.0) * 15.0;
+  int i = min(int(x), 14);
+  return mix(uColors[i], uColors[i + 1], x - float(i));
+}
+void main() {
+  vec3 n = dot(vNormal, vNormal) > 0.0 ? normalize(vNormal) : vec3(0.0, 0.0, 1.0);
+  bool inside = false, away = false;
+  if (uMesh == 1) {
+    inside = dot(n, vView) > 0.0 && !gl_FrontFacing;
+    if (dot(n, vView) > 0.0) n = -n;
+  } else {
+    vec2 d = gl_PointCoord * 2.0 - 1.0;
+    if (dot(d, d) > 1.0) discard;
+    away = n.z < -0.05;
+    if (n.z < 0.0) n = -n;
+    n = normalize(n + 0.5 * vec3(d.x, -d.y, sqrt(1.0 - dot(d, d))));
+  }
+  vec3 base = uMesh == 1 ? (inside ? vec3(0.66, 0.46, 0.35) : vec3(0.73, 0.75, 0.78)) : vec3(0.23, 0.28, 0.37);
+  if (uMode == 0) base = pow(normalize(vObject) * 0.5 + 0.5, vec3(2.2));
+  if (uMode == 1) base = pow(errorColor(vError), vec3(2.2));
+  float light = 0.75 * max(dot(n, normalize(vec3(-0.55, 0.6, 0.58))), 0.0)
+              + 0.15 * max(dot(n, normalize(vec3(0.9, 0.05, 0.43))), 0.0) + 0.12 + 0.14 * (0.5 + 0.5 * n.y) + 0.1 * n.z;
+  float gloss = 0.07 * pow(max(dot(n, normalize(vec3(-0.3, 0.33, 0.9))), 0.0), 24.0);
+  color = vec4(pow(base * light + gloss, vec3(1.0 / 2.2)), 1.0);
+  if (away) color.rgb = mix(color.rgb, vec3(1.0), 0.8); // the far side, or a normal that looks inward: pale
+}`;
+
+async function unpack(base64) {
+  const bytes = Uint8Array.from(atob(base64), (c) => c.charCodeAt(0));
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  return new Response(stream).arrayBuffer();
+}
+
+class Viewer {
+  constructor(canvas) {
+    this.canvas = canvas;
+    this.renderer = new OGL.Renderer({ canvas, antialias: true, preserveDrawingBuffer: true });
+    this.gl = this.renderer.gl;
+    this.gl.clearColor(1, 1, 1, 1);
+    this.camera = new OGL.Camera(this.gl, { fov: 30, near: 0.05, far: 60 });
+    this.home();
+    this.orbit = new OGL.Orbit(this.camera, { element: canvas, ease: 1, inertia: 0 });
+    this.program = new OGL.Program(this.gl, {
+      vertex: VERTEX, fragment: FRAGMENT, cullFace: false,
+      uniforms: {
+        uCell: { value: [1, 1, 0, 0] }, uPixels: { value: 1 }, uRadius: { value: 0.01 }, uMode: { value: 0 },
+        uMesh: { value: 0 }, uColors: { value: new Array(48).fill(0) },
+      },
+    });
+    this.loaded = new Map();
+    this.last = "";
+    const frame = () => { this.frame(); requestAnimationFrame(frame); };
+    requestAnimationFrame(frame);
+  }
+
+  home() {
+    const [a, e, far] = [Math.PI / 6, Math.PI / 12, 4.1];
+    this.camera.position.set(far * Math.cos(e) * Math.sin(a), far * Math.sin(e), far * Math.cos(e) * Math.cos(a));
+    this.camera.lookAt([0, 0, 0]);
+    if (this.orbit) { this.orbit.target.set(0, 0, 0); this.orbit.forcePosition(); }
+  }
+
+  async load(view) {
+    if (!this.loaded.has(view)) this.loaded.set(view, unpack(view.data).then((buffer) => this.build(view, buffer)));
+    return this.loaded.get(view);
+  }
+
+  build(view, buffer) {
+    const geometry = (part) => {
+      if (!part) return null;
+      const array = (type, [start, length]) => new type(buffer, start, length);
+      const attributes = {
+        position: { size: 3, data: array(Uint16Array, part.position), type: this.gl.UNSIGNED_SHORT, normalized: true },
+        normal: { size: 3, data: part.normal ? array(Int8Array, part.normal) : new Int8Array(part.position[1]), type: this.gl.BYTE, normalized: true },
+        error: { size: 1, data: part.error ? array(Uint8Array, part.error) : new Uint8Array(part.position[1] / 3), type: this.gl.UNSIGNED_BYTE, normalized: true },
+      };
+      if (part.index) attributes.index = { data: array(Uint32Array, part.index) };
+      const made = new OGL.Geometry(this.gl, attributes);
+      const mesh = new OGL.Mesh(this.gl, {
+        geometry: made, program: this.program, mode: part.index ? this.gl.TRIANGLES : this.gl.POINTS, frustumCulled: false,
+      });
+      return Object.assign(mesh, { isSurface: !!part.index, spacing: part.spacing || 0, hasError: !!part.error, hasNormal: !!part.normal });
+    };
+    return view.items.map((item) => ({ name: item.name, points: geometry(item.cloud), surface: geometry(item.surface) }));
+  }
+
+  show(state) { this.state = state; this.last = ""; }
+
+  frame() {
+    if (!this.state) return;
+    const { width, height } = this.canvas.parentElement.getBoundingClientRect();
+    this.orbit.update();
+    const key = [width, height, ...this.camera.position, ...this.orbit.target].join();
+    if (key === this.last || !width) return;
+    this.last = key;
+    const ratio = Math.min(window.devicePixelRatio || 1, 2);
+    this.renderer.dpr = ratio;
+    this.renderer.setSize(width, height);
+    const { drawings, columns, mode, colors } = this.state;
+    const rows = Math.ceil(drawings.length / columns);
+    this.camera.perspective({ aspect: width / columns / (height / rows) });
+    const gl = this.gl, u = this.program.uniforms;
+    gl.disable(gl.SCISSOR_TEST);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    gl.enable(gl.SCISSOR_TEST);
+    drawings.forEach((drawing, i) => {
+      const [column, row] = [i % columns, Math.floor(i / columns)];
+      const [w, h] = [this.canvas.width / columns, this.canvas.height / rows];
+      gl.scissor(column * w, this.canvas.height - (row + 1) * h, w, h);
+      u.uCell.value = [1 / columns, 1 / rows, (2 * column + 1) / columns - 1, 1 - (2 * row + 1) / rows];
+      u.uPixels.value = h;
+      u.uRadius.value = 0.42 * drawing.spacing;
+      const can = { normals: drawing.hasNormal, errors: drawing.hasError, plain: true };
+      u.uMode.value = can[mode] ? MODES[mode] : MODES.plain;
+      u.uMesh.value = drawing.isSurface ? 1 : 0;
+      u.uColors.value = colors;
+      for (const hidden of drawing.isSurface ? [gl.BACK, gl.FRONT] : [null]) { // where a fold has two faces at one depth, show the front
+        this.program.cullFace = hidden;
+        this.renderer.render({ scene: drawing, camera: this.camera, clear: false });
+      }
+    });
+    this.canvas.dataset.drawn = String(Number(this.canvas.dataset.drawn || 0) + 1);
+  }
+}
+
+function start() {
+  const pick = { shape: views[0].shape, kind: views[0].kind, item: null, form: "points", mode: "normals", grid: true };
+  const canvas = $("#canvas"), labels = $("#labels");
+  const viewer = new Viewer(canvas);
+  const unique = (key) => [...new Set(views.map((view) => view[key]))];
+
+  function buttons(id, values, key) {
+    $(id).replaceChildren(...values.map((value) => {
+      const button = document.createElement("button");
+      button.textContent = value;
+      button.dataset.value = value;
+      button.setAttribute("aria-pressed", String(pick[key] === value));
+      button.onclick = () => { pick[key] = value; if (key === "item") pick.grid = false; refresh(); };
+      return button;
+    }));
+  }
+
+  async function refresh() {
+    let view = views.find((v) => v.shape === pick.shape && v.kind === pick.kind);
+    if (!view) { view = views.find((v) => v.shape === pick.shape); pick.kind = view.kind; }
+    const items = await viewer.load(view);
+    const forms = ["points", ...(items.some((item) => item.surface) ? ["surfaces"] : [])];
+    if (!forms.includes(pick.form)) pick.form = "points";
+    if (!items.some((item) => item.name === pick.item)) pick.item = items[0].name;
+    const drawing = (item) => (pick.form === "surfaces" ? item.surface : item.points) || null;
+    const shown = (pick.grid ? items : items.filter((item) => item.name === pick.item)).filter(drawing);
+    buttons("#shapes", unique("shape"), "shape");
+    buttons("#kinds", unique("kind"), "kind");
+    buttons("#items", items.filter(drawing).map((item) => item.name), "item");
+    buttons("#forms", forms, "form");
+    buttons("#modes", Object.keys(MODES), "mode");
+    for (const button of $("#items").children) button.setAttribute("aria-pressed", String(!pick.grid && pick.item === button.dataset.value));
+    $("#grid").setAttribute("aria-pressed", String(pick.grid));
+    const box = canvas.parentElement.getBoundingClientRect(), count = shown.length || 1;
+    const cell = (c) => Math.min(box.width / c, box.height / Math.ceil(count / c));
+    const columns = Array.from({ length: count }, (_, i) => i + 1).reduce((a, b) => (cell(b) > cell(a) ? b : a));
+    labels.style.gridTemplateColumns = `repeat(${columns}, 1fr)`;
+    labels.replaceChildren(...shown.map((item) => Object.assign(document.createElement("span"), { textContent: item.name })));
+    $("#bar").hidden = pick.mode !== "errors";
+    $("#bar-end").textContent = view.limit;
+    viewer.show({ drawings: shown.map(drawing), columns, mode: pick.mode, colors: colors });
+  }
+
+  $("#grid").onclick = () => { pick.grid = true; refresh(); };
+  $("#home").onclick = () => { viewer.home(); viewer.last = ""; };
+  document.addEventListener("keydown", (event) => {
+    const button = $("#items").children[Number(event.key) - 1];
+    if (button && !event.ctrlKey && !event.metaKey && !event.altKey) button.click();
+  });
+  // A link such as page.html#shape=duck&mode=errors opens that view.
+  for (const [key, value] of new URLSearchParams(location.hash.slice(1))) {
+    if (key === "item") pick.grid = false;
+    if (key in pick) pick[key] = key === "grid" ? value === "true" : value;
+  }
+  refresh();
+}
+
+// Tables: a click on a head sorts, a second one turns the order round.
+for (const table of document.querySelectorAll("table.sortable")) {
+  table.tHead.rows[table.tHead.rows.length - 1].querySelectorAll("th").forEach((head, column) => {
+    head.tabIndex = 0;
+    const sort = () => {
+      const down = head.getAttribute("aria-sort") === "ascending";
+      table.querySelectorAll("th").forEach((other) => other.removeAttribute("aria-sort"));
+      head.setAttribute("aria-sort", down ? "descending" : "ascending");
+      const value = (row) => { const v = row.cells[column].dataset.value; return v === undefined ? row.cells[column].textContent : v === "" ? Infinity : Number(v); };
+      const order = (a, b) => { const [x, y] = [value(a), value(b)]; return (typeof x === "string" ? x.localeCompare(y) : x === y ? 0 : x - y) * (down ? -1 : 1); };
+      table.tBodies[0].append(...[...table.tBodies[0].rows].sort(order));
+    };
+    head.onclick = sort;
+    head.onkeydown = (event) => { if (event.key === "Enter") sort(); };
+  });
+}
+for (const tab of document.querySelectorAll("#tabs button")) {
+  tab.onclick = () => {
+    for (const other of document.querySelectorAll("#tabs button")) other.setAttribute("aria-pressed", String(other === tab));
+    for (const section of document.querySelectorAll("section.kind")) section.hidden = section.dataset.kind !== tab.dataset.kind;
+  };
+}
+if (views.length) {
+  try { start(); } catch (error) { $("#viewer").textContent = `The 3D views need WebGL 2, which this browser does not offer (${error.message}).`; }
+}
