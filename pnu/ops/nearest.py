@@ -1,7 +1,8 @@
-"""Neighbour searches between two clouds: trees on the CPU, chunks of bounded memory on other devices."""
+"""Neighbour searches between two clouds: trees on the CPU, kernels on a GPU, chunks of bounded memory elsewhere."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +10,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-CHUNK_ELEMENTS = 2**25  # distances held at once where no tree is used: 128 MiB in float32
+CHUNK_ELEMENTS = 2**25  # distances held at once where neither tree nor kernel is used: 128 MiB in float32
+KERNEL_K = 64  # more neighbours than this do not fit a kernel's registers
 
 
 class Neighbors(NamedTuple):
@@ -33,6 +35,9 @@ def knn(query: Tensor, target: Tensor, k: int) -> Neighbors:
     query, target = query.detach(), target.detach()
     if query.device.type == "cpu":
         return _knn_tree(query, target, k)
+    kernels = gpu_kernels(query)
+    if kernels and k <= KERNEL_K:
+        return Neighbors(*kernels.knn(query, target, k))
     return _knn_chunks(query, target, k)
 
 
@@ -56,6 +61,9 @@ def ball_query(query: Tensor, target: Tensor, radius: float, k: int) -> Tensor:
     query, target = query.detach(), target.detach()
     if query.device.type == "cpu":
         return _ball_tree(query, target, radius, k)
+    kernels = gpu_kernels(query)
+    if kernels and k <= KERNEL_K:
+        return kernels.ball_query(query, target, radius, k)
     return _ball_chunks(query, target, radius, k)
 
 
@@ -68,6 +76,17 @@ def per_cloud(function: Callable[[int], None], clouds: int) -> None:
         return
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(function, range(clouds)))
+
+
+def gpu_kernels(points: Tensor) -> ModuleType | None:
+    """`pnu.ops.kernels` where they can run: float32 on a CUDA device, with triton installed."""
+    if points.device.type != "cuda" or points.dtype != torch.float32:
+        return None
+    try:
+        from pnu.ops import kernels
+    except ImportError:
+        return None
+    return kernels
 
 
 def _check(query: Tensor, target: Tensor) -> None:

@@ -5,9 +5,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pnu.ops.nearest import nearest, per_cloud
+from pnu.ops.nearest import gpu_kernels, nearest, per_cloud
 
 NEAR_ORIGIN_SQ = 1e-3  # the released code's threshold on |x|^2
+BUCKETS_PAY = 2**16  # from this many distances on
 
 
 def farthest_points(points: Tensor, m: int, *, start: int | Tensor = 0, skip_near_origin: bool = False) -> Tensor:
@@ -24,7 +25,11 @@ def farthest_points(points: Tensor, m: int, *, start: int | Tensor = 0, skip_nea
         raise ValueError(f"start: expected indices in 0..{n - 1}, found {start}")
     xyz = _float32(points.detach())
     if points.device.type != "cpu":
-        return _farthest_steps(xyz, m, first.to(points.device), skip_near_origin)
+        first = first.to(points.device)
+        kernels = gpu_kernels(xyz)
+        if kernels and n <= kernels.FARTHEST_LIMIT:
+            return kernels.farthest_points(xyz, m, first, NEAR_ORIGIN_SQ if skip_near_origin else -1.0)
+        return _farthest_steps(xyz, m, first, skip_near_origin)
     arrays, starts, out = xyz.numpy(), first.tolist(), np.empty((clouds, m), np.int64)
 
     def sample(b: int) -> None:
@@ -115,7 +120,7 @@ def _farthest_off_origin(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
 def _greedy(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
     """Bucket sampler (QuickFPS) where it pays; it counts its start in its own tree's order."""
     n = len(xyz)
-    if m * n > 2**16:
+    if n >= 16 and m * n > BUCKETS_PAY:
         height = max(3, round(np.log2(n) / 2 - 1))
         chosen = fpsample.bucket_fps_kdline_sampling(xyz, m, height, _tree_slot(xyz, height, start))
         if chosen[0] == start:
