@@ -27,6 +27,7 @@ class Cloud(NamedTuple):
     attributes: dict[str, np.ndarray]
 
 
+@np.errstate(invalid="ignore", over="ignore")  # what is not finite is named by the checks
 def read_cloud(path: str | Path, *, minimum: int = 16, normals: bool = True) -> Cloud:
     """Read a point cloud; normals are brought to unit length, or left out with `normals=False`.
 
@@ -44,6 +45,7 @@ def read_cloud(path: str | Path, *, minimum: int = 16, normals: bool = True) -> 
     return check_cloud(cloud, str(path), minimum=minimum)
 
 
+@np.errstate(invalid="ignore", over="ignore")
 def check_cloud(cloud: Cloud, name: str, *, minimum: int = 16) -> Cloud:
     """The cloud with float64 points and unit normals; `ValueError`, beginning with `name`, if it cannot be used."""
     points = np.asarray(cloud.points, np.float64)
@@ -147,8 +149,7 @@ def _from_table(path: Path, values: np.ndarray) -> Cloud:
         raise ValueError(
             f"{path}: has {values.shape[1]} columns; expected 3 (x y z) or 6 (x y z nx ny nz), remove the others"
         )
-    with np.errstate(over="ignore", invalid="ignore"):
-        lengths = np.linalg.norm(more, axis=1)
+    lengths = np.linalg.norm(more, axis=1)
     lengths = lengths[np.isfinite(lengths) & (lengths > 0)]
     if not len(lengths) or np.mean(np.abs(lengths - 1) < 0.05) > 0.9:
         return Cloud(points, more, {})

@@ -8,7 +8,7 @@ import numpy as np
 
 from pnu.io.atomic import atomic_path
 from pnu.io.ply import Lists, read_ply, write_ply
-from pnu.io.text import fan, known_suffix, open_file, table, text_lines
+from pnu.io.text import fan, indices, known_suffix, open_file, table, text_lines
 
 
 class Mesh(NamedTuple):
@@ -27,6 +27,7 @@ class Geometry(NamedTuple):
     colors: np.ndarray | None = None
 
 
+@np.errstate(invalid="ignore", over="ignore")  # what is not finite is named by the checks
 def read_mesh(path: str | Path) -> Mesh:
     """Read a triangle mesh; polygons are cut into fans.
 
@@ -128,7 +129,11 @@ def read_obj(path: Path) -> Geometry:
         raise ValueError(f"{path}: a normal (vn) has {given.shape[1]} numbers; expected 3")
     counts, corners, named = _obj_faces(path, rows["f"], len(vertices), len(given))
     normals = None
-    if len(given) and len(named) and np.all((named >= 0) & (named < len(given))) and np.all(corners < len(vertices)):
+    if (
+        len(given)
+        and len(named)
+        and np.all((named >= 0) & (named < len(given)) & (corners >= 0) & (corners < len(vertices)))
+    ):
         normals = np.zeros_like(vertices)
         np.add.at(normals, corners, given[named])
     elif len(given) == len(vertices):
@@ -150,13 +155,13 @@ def _obj_faces(path: Path, lines: list[str], vertices: int, normals: int) -> tup
                 named.append(normal - 1 if normal > 0 else normals + normal if normal else -1)
         except ValueError:
             raise ValueError(f"{path}: 'f {line[:40]}' is no face; expected corners such as 1/1/1 or 1") from None
-    return np.array(counts, np.int64), np.array(corners, np.int64), np.array(named, np.int64)
+    return indices(path, counts), indices(path, corners), indices(path, named)
 
 
 def as_colors(values: np.ndarray) -> np.ndarray:
     """uint8 of colours in 0..1 or 0..255."""
-    scale = 255 if values.max(initial=0) <= 1 else 1
-    return np.rint(np.clip(values * scale, 0, 255)).astype(np.uint8)
+    scale = 255 if np.nanmax(values, initial=0) <= 1 else 1
+    return np.rint(np.clip(np.nan_to_num(values) * scale, 0, 255)).astype(np.uint8)
 
 
 def read_off(path: Path) -> Geometry:
@@ -197,7 +202,7 @@ def read_off(path: Path) -> Geometry:
                 raise ValueError
         except ValueError:
             raise ValueError(f"{path}: '{line[:40]}' is no face; expected a count and as many corners") from None
-    faces = fan(np.array(counts, np.int64), np.array(corners, np.int64))
+    faces = fan(indices(path, counts), indices(path, corners))
     return Geometry(values[:, :3], faces, values[:, 3:6] if "N" in head else None, colors)
 
 

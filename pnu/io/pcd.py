@@ -20,14 +20,13 @@ def read_pcd(path: Path) -> dict[str, np.ndarray]:
         counts = [int(word) for word in header.get("COUNT", ["1"] * len(names))]
         kinds = [KINDS[word] for word in header["TYPE"]]
         points = int(header["POINTS"][0]) if "POINTS" in header else int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
-        fields = [
-            (f"{i}", f"<{kind}{size}", (count,))
-            for i, (kind, size, count) in enumerate(zip(kinds, sizes, counts, strict=True))
-        ]
-        dtype = np.dtype(fields)
+        fields = list(zip(kinds, sizes, counts, strict=True))
         repeated = any(names.count(name) > 1 for name in names if name != "_")
         if repeated or len(names) != len(fields) or points < 0 or min(counts) < 1:
             raise ValueError
+        if max(counts) > len(data):  # and numpy would overflow
+            raise ValueError
+        dtype = np.dtype([(f"{i}", f"<{kind}{size}", (count,)) for i, (kind, size, count) in enumerate(fields)])
     except (ValueError, KeyError, TypeError, IndexError):
         raise ValueError(
             f"{path}: FIELDS, SIZE, TYPE, COUNT and POINTS of the header disagree; save it again"
@@ -87,8 +86,7 @@ def _text(path: Path, body: bytes, points: int, dtype: np.dtype) -> list[np.ndar
     if values.shape != (points, sum(widths)):
         raise ValueError(f"{path}: the header names {sum(widths)} columns, the lines have {values.shape[1]}")
     columns = np.split(values, np.cumsum(widths)[:-1], axis=1)
-    with np.errstate(invalid="ignore", over="ignore"):
-        return [column.astype(dtype[i].base) for i, column in enumerate(columns)]
+    return [column.astype(dtype[i].base) for i, column in enumerate(columns)]
 
 
 def _compressed(path: Path, data: bytes, start: int, points: int, dtype: np.dtype) -> list[np.ndarray]:

@@ -53,12 +53,11 @@ def read_ply(path: Path, wanted: set[str]) -> dict[str, Columns]:
     if order is None:
         lines = iter(data[start:].decode("ascii", "replace").splitlines())
         rows = (line for line in lines if line.strip())
-        del data
     for element in elements:
         if not wanted - found.keys():
             break
         if order is None:
-            columns = _text(path, element, list(islice(rows, element.size)))
+            columns = _text(path, element, list(islice(rows, min(element.size, len(data)))))
         else:
             columns, start = _binary(path, data, start, element, order)
         if element.name in wanted:
@@ -119,8 +118,7 @@ def _text(path: Path, element: Element, lines: list[str]) -> Columns:
                 f"{path}: element '{element.name}' has {len(names)} properties, its lines {values.shape[1]} columns; "
                 "save the file again"
             )
-        with np.errstate(invalid="ignore"):
-            return {item.name: values[:, i].astype(item.type) for i, item in enumerate(element.properties)}
+        return {item.name: values[:, i].astype(item.type) for i, item in enumerate(element.properties)}
     columns: dict[str, list[float]] = {name: [] for name in names}
     counts: dict[str, list[int]] = {item.name: [] for item in element.properties if item.length}
     for line in lines:
@@ -140,10 +138,9 @@ def _text(path: Path, element: Element, lines: list[str]) -> Columns:
                 f"{path}: '{line.strip()[:40]}' does not fit element '{element.name}'; save the file again"
             ) from None
     result: Columns = {}
-    with np.errstate(invalid="ignore"):
-        for item in element.properties:
-            values = np.array(columns[item.name], dtype=np.float64).astype(item.type)
-            result[item.name] = Lists(np.array(counts[item.name], dtype=np.int64), values) if item.length else values
+    for item in element.properties:
+        values = np.array(columns[item.name], dtype=np.float64).astype(item.type)
+        result[item.name] = Lists(np.array(counts[item.name], dtype=np.int64), values) if item.length else values
     return result
 
 
@@ -154,7 +151,10 @@ def _binary(path: Path, data: bytes, start: int, element: Element, order: str) -
         raise _short(path, element, f"{len(data) - start} bytes more")
     if element.size == 0 or least == 0:
         return {item.name: np.empty(0, item.type) for item in element.properties}, start
-    lengths, _ = _row_lengths(data, start, element, order)
+    try:
+        lengths, _ = _row_lengths(data, start, element, order)
+    except struct.error:
+        raise _short(path, element, "0") from None
     dtype = _row_dtype(element, order, lengths)
     if element.size * dtype.itemsize <= len(data) - start:
         rows = np.frombuffer(data, dtype, element.size, start)

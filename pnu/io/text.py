@@ -71,6 +71,14 @@ def _blame(path: Path, lines: Iterable[str], first_line: int) -> NoReturn:
     raise ValueError(f"{path}: cannot be read as a table of numbers; check its lines")
 
 
+def indices(path: Path, values: list[int]) -> np.ndarray:
+    """int64 of whole numbers read from text; `ValueError` for one that no file can mean."""
+    try:
+        return np.array(values, np.int64)
+    except OverflowError:
+        raise ValueError(f"{path}: a face has a corner beyond 2^63; the file is damaged, save it again") from None
+
+
 def fan(counts: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Triangles (f, 3) of polygons given as counts (p,) and their corners in a row; each is cut as a fan."""
     starts = np.cumsum(counts) - counts
