@@ -15,11 +15,12 @@ from pnu.data.shapes import unit
 from pnu.io import Mesh, atomic_path
 from pnu.ops.edges import sharp_edge_points
 from pnu.ops.sampling import farthest_points_large
-from pnu.ops.surface import sample_poisson_disk
+from pnu.ops.surface import sample_area
 
 PATCH_POINTS = 4096
 EDGE_POINTS = 256
-SHARE = (0.1, 0.3)  # of its shape that a patch covers, smallest and largest
+SHARES = (0.3, 0.1)  # of its shape that a patch covers
+OVERSAMPLING = 5  # random points from which each of the evenly spread ones is chosen
 
 
 class Patches(NamedTuple):
@@ -31,18 +32,19 @@ class Patches(NamedTuple):
 
 def cut_patches(mesh: Mesh, count: int, rng: np.random.Generator) -> Patches:
     """Patches of 4096 evenly spread points: centres by farthest points, the nearest points of each by distance, as at
-    inference. Half of them cover the largest share of the shape, half the smallest: of two samplings, one sparser."""
-    clouds, edges = [], []
+    inference. Half of them are cut from a dense sampling and cover a small share of the shape, half from a sparse one.
+    """
     sharp = sharp_edge_points(mesh, spacing=0.01)
-    for share, part in zip(SHARE[::-1], (count - count // 2, count // 2), strict=True):
-        if not part:
-            continue
-        dense = sample_poisson_disk(mesh, round(PATCH_POINTS / share), rng).astype(np.float32)
-        centers = dense[farthest_points_large(dense[:, :3], part), :3]
-        idx = cKDTree(dense[:, :3]).query(centers, PATCH_POINTS)[1]
-        clouds.append(dense[idx])
-        edges.append(np.stack([edges_of(patch, sharp, rng) for patch in clouds[-1]]))
-    return Patches(np.concatenate(clouds), np.concatenate(edges))
+    most = round(PATCH_POINTS / min(SHARES))
+    area = sample_area(mesh, OVERSAMPLING * most, rng).astype(np.float32)
+    even = area[farthest_points_large(area[:, :3], most)]  # so is each front part of it
+    clouds = []
+    for share, part in zip(SHARES, (count - count // 2, count // 2), strict=True):
+        dense = even[: round(PATCH_POINTS / share)]
+        centers = dense[farthest_points_large(dense[:, :3], part), :3] if part else dense[:0, :3]
+        clouds.append(dense[cKDTree(dense[:, :3]).query(centers, PATCH_POINTS)[1]])
+    patches = np.concatenate(clouds)
+    return Patches(patches, np.stack([edges_of(patch, sharp, rng) for patch in patches]))
 
 
 def edges_of(patch: np.ndarray, sharp: np.ndarray, rng: np.random.Generator) -> np.ndarray:
