@@ -1,0 +1,255 @@
+"""Densify whole clouds with a trained network: no Hydra, no Lightning, usable from a notebook."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from os import PathLike
+from typing import Protocol, cast, runtime_checkable
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from pnu import checkpoint
+from pnu.io import Cloud, check_cloud
+from pnu.ops import patches
+from pnu.ops.nearest import nearest
+from pnu.ops.normalize import Frame, unit_sphere_frame
+from pnu.ops.normals import estimate_normals, flip_to_reference
+
+MINIMUM = 16  # points of a cloud
+SMALLEST_PATCH = 64  # points that every network accepts; a smaller cloud is repeated up to it
+LARGEST = 10**9  # points of an output
+SLACK = 1.1  # growth beyond the network's ratio for which overlapping patches have points enough
+ZERO = 1e-6  # predicted normals shorter than this have no direction
+
+Progress = Callable[[str, int, int], None]
+"""progress(stage, done, total): called before the first and after each step of a stage."""
+
+
+@runtime_checkable
+class CloudUpsampler(Protocol):
+    """A procedure for whole clouds. A model that has one of its own gets no patches.
+
+    upsample_cloud(cloud (n, 6) float64 in the unit sphere, on the model's device, count) -> (count, 6), or (count, 3)
+    without normals, in the same frame. All randomness comes from the generator; batch_size bounds the memory.
+    """
+
+    def upsample_cloud(
+        self, cloud: Tensor, count: int, *, batch_size: int | None, generator: torch.Generator, progress: Progress
+    ) -> Tensor: ...
+
+
+def upsample(
+    points: np.ndarray,
+    normals: np.ndarray | None = None,
+    *,
+    ratio: float = 4,
+    model: nn.Module | str | PathLike[str] | None = None,
+    patch_size: int | None = None,
+    device: str = "auto",
+    batch_size: int | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> np.ndarray:
+    """A denser cloud on the same surface.
+
+    The procedure of the paper (section Inference): patches around farthest points are brought to the unit sphere, go
+    through the network and back, and farthest points of all predictions are kept. In addition every input point
+    lies in a patch, and passes are repeated for ratios beyond the network's. The result depends neither on the order of
+    the points nor on repeated ones; a cloud of fewer than 64 points fills a patch by repetition.
+
+    Args:
+        points: (n, 3), n >= 16, in any unit and anywhere.
+        normals: (n, 3), of any length but zero; estimated and oriented where missing.
+        ratio: points out for each point in, any number >= 1.
+        model: network, run folder, or None for the newest finished run under outputs/.
+        patch_size: points of a patch; default: what the network was made for (1024).
+        device: "auto" (where the given network is; else CUDA where there is one), "cpu", "cuda", "cuda:1" ...
+        batch_size: patches at once on a GPU, by default 64; on the CPU each thread takes one.
+        seed: of models that draw random numbers; the paper's procedure draws none.
+        progress: called as progress(stage, done, total).
+
+    Returns:
+        (round(ratio n), 6) float64: points in the frame and unit of the input, and unit normals.
+
+    Raises:
+        ValueError: in one line, which argument is wrong and what was expected.
+    """
+    progress = progress or (lambda stage, done, total: None)
+    given = check_cloud(Cloud(np.asarray(points), normals, {}), "points", minimum=MINIMUM)
+    count = output_count(len(given.points), ratio)
+    for name, value in (("patch_size", patch_size), ("batch_size", batch_size)):
+        if value is not None and value < 1:
+            raise ValueError(f"{name}={value}: expected a whole number >= 1")
+    network, target = _on_device(model, device)
+    upsampler = network if isinstance(network, CloudUpsampler) else Patchwise(network, patch_size)
+    sparse, frame = _prepare(given, progress)
+    generator = torch.Generator().manual_seed(seed)
+    training = network.training
+    network.eval()
+    try:
+        with torch.no_grad():
+            raw = upsampler.upsample_cloud(
+                sparse.to(target), count, batch_size=batch_size, generator=generator, progress=progress
+            )
+            dense = with_unit_normals(raw.cpu().double(), sparse)
+    finally:
+        network.train(training)
+    return frame.from_unit(dense[None])[0].numpy()
+
+
+def output_count(n: int, ratio: float) -> int:
+    """round(ratio n), or `ValueError` for a ratio that is no number >= 1 or asks for more than 1e9 points."""
+    if not 1 <= ratio < float("inf"):
+        raise ValueError(f"ratio={ratio:g}: expected a number >= 1, the points out for each point in")
+    count = round(ratio * n)
+    if count > LARGEST:
+        raise ValueError(f"ratio={ratio:g}: asks for {count} points, at most {LARGEST:g} are made; lower it")
+    return count
+
+
+def _on_device(model: nn.Module | str | PathLike[str] | None, device: str) -> tuple[nn.Module, torch.device]:
+    """The network, and the device it now lies on."""
+    if model is None:
+        model = checkpoint.newest_run()
+        if model is None:
+            raise ValueError("run: no finished run under outputs/; train one with `make train`, or give run=FOLDER")
+    given = isinstance(model, nn.Module)
+    network = model if isinstance(model, nn.Module) else checkpoint.load(model)
+    if device != "auto":
+        try:
+            torch.empty(0, device=device)
+        except (RuntimeError, AssertionError):
+            raise ValueError(f"device={device}: is not here; expected auto, cpu, or cuda where there is one") from None
+        target = torch.device(device)
+    elif given:
+        target = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
+    else:
+        target = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    return network.to(target), target
+
+
+def _prepare(cloud: Cloud, progress: Progress) -> tuple[Tensor, Frame]:
+    """Different points in a fixed order with normals, (n, 6) float64 in the unit sphere, and the way back."""
+    points, normals = cloud.points, cloud.normals
+    order = np.lexsort([*(() if normals is None else normals.T), *points.T])
+    repeated = np.zeros(len(points), bool)
+    repeated[1:] = (np.diff(points[order], axis=0) == 0).all(1)
+    kept = order[~repeated]
+    if len(kept) < MINIMUM:
+        raise ValueError(f"points: holds {len(kept)} different points; at least {MINIMUM} are needed")
+    frame = unit_sphere_frame(torch.from_numpy(points[kept])[None])
+    unit = frame.to_unit(torch.from_numpy(points[kept])[None])
+    if normals is None:
+        progress("normals", 0, 1)
+        directions = estimate_normals(unit)[0]
+        progress("normals", 1, 1)
+    else:
+        directions = torch.from_numpy(normals[kept])
+    return torch.cat([unit[0], directions], 1), frame
+
+
+class Patchwise:
+    """The paper's procedure for a network of patches, in passes of `network.ratio` times as many points each.
+
+    patch_size: points of a patch; None: what the network says, or 1024. The cloud stays on the CPU, in float64;
+    patches go to the network in its own type and device.
+    """
+
+    def __init__(self, network: nn.Module, patch_size: int | None = None) -> None:
+        self.network = network
+        self.ratio = int(cast(int, network.ratio))
+        self.patch_size = patch_size or int(getattr(network, "patch_size", 1024))
+        self.like = next(network.parameters(), torch.empty(0))  # tells device and type
+
+    def upsample_cloud(
+        self, cloud: Tensor, count: int, *, batch_size: int | None, generator: torch.Generator, progress: Progress
+    ) -> Tensor:
+        """cloud (n, 6) in the unit sphere -> (count, 3 or 6) on the CPU; nothing is random."""
+        cloud = cloud.cpu()
+        batch_size = 1 if self.like.device.type == "cpu" else batch_size or 64
+        *before, last = self.pass_sizes(len(cloud), count)
+        for size in before:
+            cloud = with_unit_normals(self._one_pass(cloud, size, batch_size, progress), cloud)
+        return self._one_pass(cloud, last, batch_size, progress)
+
+    def pass_sizes(self, n: int, count: int) -> list[int]:
+        """Number of points after each pass from n to count: as few passes as possible, all with the same growth."""
+        reach = self.ratio * (SLACK if n > self.patch_size else 1)
+        passes = 1
+        while count > n * reach**passes:
+            passes += 1
+        sizes = [n]
+        for i in range(1, passes):
+            sizes.append(min(math.ceil(n * (count / n) ** (i / passes)), self.ratio * sizes[-1]))
+        return [*sizes[1:], count]
+
+    def _one_pass(self, cloud: Tensor, count: int, batch_size: int, progress: Progress) -> Tensor:
+        """The network on patches of the cloud (n, 6), and farthest points of all it predicts: (count, 3 or 6)."""
+        n, size = len(cloud), min(self.patch_size, len(cloud))
+        centers = 1 if size == n else max(1, round(self.ratio * n / size))
+        idx = patches.extract(cloud, centers, size, cover=True)
+        if size < SMALLEST_PATCH:
+            idx = idx[:, torch.arange(SMALLEST_PATCH) % size]
+        stage = f"network, {n} points"
+        predicted = []
+        progress(stage, 0, len(idx))
+        for dense in self._predict(cloud, idx.split(batch_size)):
+            predicted.append(dense.flatten(0, 1))
+            progress(stage, min(len(predicted) * batch_size, len(idx)), len(idx))
+        everything = _finite(torch.cat(predicted))
+        stage = f"farthest points, {count} of {len(everything)}"
+        progress(stage, 0, 1)
+        kept = patches.merge(everything[None], count)
+        progress(stage, 1, 1)
+        return kept
+
+    def _predict(self, cloud: Tensor, batches: Sequence[Tensor]) -> Iterator[Tensor]:
+        """Predictions for batches of patches, in the cloud's frame.
+
+        On the CPU each thread works on a patch of its own. That is faster than many threads in one operation, and the
+        last digit of a matrix product, which may decide between two farthest points, depends on nothing else.
+        """
+
+        @torch.no_grad()
+        def predict(idx: Tensor) -> Tensor:
+            patch = cloud[idx]
+            frame = unit_sphere_frame(patch)  # in float64, so that float32 has only the patch to resolve
+            return frame.from_unit(self.network(frame.to_unit(patch).to(self.like)).cpu().double())
+
+        threads = torch.get_num_threads()
+        if threads == 1 or self.like.device.type != "cpu":
+            yield from map(predict, batches)
+            return
+        try:
+            with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+                yield from pool.map(predict, batches)
+        finally:
+            torch.set_num_threads(threads)
+
+
+def with_unit_normals(dense: Tensor, sparse: Tensor) -> Tensor:
+    """Predictions (m, 3) or (m, 6) with unit normals, (m, 6); `sparse` (n, 6) is the cloud they were made from.
+
+    A predicted normal without direction becomes that of the nearest input point. Where none are predicted they are
+    estimated from the predicted points, with the side of the nearest input normal.
+    """
+    points = _finite(dense)[:, :3]
+    if dense.shape[1] == 3:
+        normals = estimate_normals(points[None], orient=False)
+        normals = flip_to_reference(normals, points[None], sparse[None, :, :3], sparse[None, :, 3:])[0]
+    else:
+        normals = dense[:, 3:6]
+    length = normals.norm(dim=1, keepdim=True)
+    lost = (~(length > ZERO) | length.isinf()).squeeze(1)  # NaN counts as lost
+    normals = normals / length
+    if bool(lost.any()):
+        normals[lost] = sparse[nearest(points[None, lost], sparse[None, :, :3]).idx[0], 3:]
+    return torch.cat([points, normals], 1)
+
+
+def _finite(prediction: Tensor) -> Tensor:
+    if not bool(torch.isfinite(prediction[:, :3]).all()):
+        raise ValueError("model: predicted points that are NaN or infinite; its weights are damaged, train it again")
+    return prediction

@@ -1,0 +1,104 @@
+"""Densify a point cloud file: `python -m pnu.upsample input=cloud.ply output=dense.ply`.
+
+The module can be called, so that `pnu.upsample(points)` is `pnu.inference.upsample` whether or not it was imported.
+"""
+
+import sys
+import time
+import types
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pnu.run import command, doc
+
+
+@dataclass
+class Upsample:
+    """Densify a point cloud file with a trained network."""
+
+    input: str = doc("file to read: ply, xyz, txt, pcd, obj, off or npy")
+    output: str = doc("file to write; its suffix says the format")
+    run: str | None = doc("run folder with the network; null: the newest finished one under outputs/")
+    ratio: float = doc("points out for each point in, any number >= 1")
+    normals: str = doc("auto: the file's, estimated where it has none; estimate: always estimated")
+    patch_size: int | None = doc("points of a patch; null: what the network was made for")
+    batch_size: int | None = doc("patches at once on a GPU, bounds its memory; null: 64")
+    device: str = doc("auto, cpu, cuda, cuda:1 ...")
+    seed: int = doc("of models that draw random numbers")
+    quiet: bool = doc("print nothing but errors")
+
+
+def upsample(cfg: Any) -> None:
+    from pnu import io
+
+    started = time.perf_counter()
+    say: Callable[[str], None] = (lambda text: None) if cfg.quiet else print
+    if cfg.normals not in ("auto", "estimate"):
+        raise ValueError(f"normals={cfg.normals}: expected auto or estimate")
+    if not 1 <= cfg.ratio < float("inf"):  # here too: the network's libraries take seconds to load
+        raise ValueError(f"ratio={cfg.ratio:g}: expected a number >= 1, the points out for each point in")
+    io.check_output(cfg.output)
+    if Path(cfg.output).resolve() == Path(cfg.input).resolve():
+        raise ValueError(f"output={cfg.output}: is the input; give another name")
+    cloud = io.read_cloud(cfg.input, normals=cfg.normals == "auto")
+    origin = "with normals" if cloud.normals is not None else "without normals: estimated and oriented"
+    say(f"input:  {cfg.input}, {len(cloud.points)} points {origin}")
+    if cloud.attributes:
+        say(f"        left out: {', '.join(cloud.attributes)} (points and normals are upsampled, nothing else)")
+
+    from pnu import checkpoint, inference
+
+    run = cfg.run or checkpoint.newest_run()
+    if run is None:
+        raise ValueError("run: no finished run under outputs/; train one with `make train`, or give run=FOLDER")
+    say(f"run:    {run}{'' if cfg.run else ' (the newest finished one)'}")
+    network = checkpoint.load(run)
+    with progress_bar(cfg.quiet) as progress:
+        dense = inference.upsample(
+            cloud.points,
+            cloud.normals,
+            ratio=cfg.ratio,
+            model=network,
+            patch_size=cfg.patch_size,
+            device=cfg.device,
+            batch_size=cfg.batch_size,
+            seed=cfg.seed,
+            progress=progress,
+        )
+    io.write_cloud(cfg.output, dense[:, :3], dense[:, 3:])
+    say(f"output: {cfg.output}, {len(dense)} points with unit normals, {time.perf_counter() - started:.1f} s")
+    say(f"next:   python -m pnu.reconstruct input={cfg.output} output=mesh.ply")
+
+
+@contextmanager
+def progress_bar(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
+    """A bar on stderr for each stage, with the time left."""
+    from rich.console import Console
+    from rich.progress import Progress, TaskID
+
+    tasks: dict[str, TaskID] = {}
+    with Progress(console=Console(stderr=True), disable=quiet) as bar:
+
+        def progress(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total)
+            bar.update(tasks[stage], completed=done, total=total)
+
+        yield progress
+
+
+class _Callable(types.ModuleType):
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        from pnu.inference import upsample
+
+        return upsample(*args, **kwargs)
+
+
+sys.modules[__name__].__class__ = _Callable
+main = command(upsample, Upsample)
+
+if __name__ == "__main__":
+    main()

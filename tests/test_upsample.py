@@ -1,0 +1,144 @@
+"""`python -m pnu.upsample` on real files."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from pnu.io import read_cloud, write_cloud, write_json
+from pnu.models.pnu import PNU
+
+MODEL = {"_target_": "pnu.models.pnu.PNU", "ratio": 2, "local_features": False}
+
+
+def make_run(folder: Path, status: str = "finished") -> Path:
+    """A run folder with the small network, untrained."""
+    (folder / "checkpoints").mkdir(parents=True)
+    torch.manual_seed(0)
+    network = PNU(ratio=2, local_features=False)
+    state = {f"model.{name}": value for name, value in network.state_dict().items()}
+    torch.save({"state_dict": state}, folder / "checkpoints" / "best.ckpt")
+    (folder / "config.yaml").write_text(yaml.safe_dump({"model": MODEL}))
+    write_json(folder / "run.json", {"status": status})
+    return folder
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    """A folder with a finished run, and a cloud with normals."""
+    make_run(tmp_path / "outputs" / "2026-01-02" / "03-04-05_small")
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    write_cloud(tmp_path / "cloud.ply", 40 * points + 1e6, points)
+    return tmp_path
+
+
+def upsample(place: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "pnu.upsample", *arguments]
+    return subprocess.run(command, cwd=place, capture_output=True, text=True, check=False, timeout=120)
+
+
+def test_newest_run_and_report(place: Path) -> None:
+    make_run(place / "outputs" / "2026-01-02" / "04-00-00_dead", status="failed")
+    done = upsample(place, "input=cloud.ply", "output=dense.xyz", "ratio=3.5")
+    assert done.returncode == 0, done.stderr
+    dense = read_cloud(place / "dense.xyz")
+    assert dense.points.shape == (700, 3)
+    np.testing.assert_allclose(np.linalg.norm(np.loadtxt(place / "dense.xyz")[:, 3:], axis=1), 1, atol=1e-6)
+    assert np.abs(dense.points.mean(0) - 1e6).max() < 100
+    lines = done.stdout.splitlines()
+    assert lines[0] == "input:  cloud.ply, 200 points with normals"
+    assert lines[1] == "run:    outputs/2026-01-02/03-04-05_small (the newest finished one)"
+    assert lines[2].startswith("output: dense.xyz, 700 points with unit normals, ")
+    assert lines[3] == "next:   python -m pnu.reconstruct input=dense.xyz output=mesh.ply"
+    assert "farthest points" in done.stderr
+
+
+def test_given_run_quiet_and_estimated_normals(place: Path) -> None:
+    run = make_run(place / "elsewhere")
+    points, normals, _ = read_cloud(place / "cloud.ply")
+    np.save(place / "points.npy", points)
+    write_cloud(place / "inward.ply", points, -normals, {"colors": np.zeros((200, 3), np.uint8)})
+    done = upsample(place, "input=points.npy", "output=a.npy", f"run={run}", "ratio=2")
+    assert "input:  points.npy, 200 points without normals: estimated and oriented" in done.stdout
+    assert f"run:    {run}\n" in done.stdout
+    done = upsample(
+        place, "input=inward.ply", "output=b.npy", f"run={run}", "ratio=2", "normals=estimate", "quiet=true"
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    np.testing.assert_array_equal(np.load(place / "a.npy"), np.load(place / "b.npy"))
+    done = upsample(place, "input=inward.ply", "output=c.pcd", f"run={run}", "ratio=1")
+    assert "left out: colors (points and normals are upsampled, nothing else)" in done.stdout
+    assert len(read_cloud(place / "c.pcd").points) == 200
+
+
+GOOD = ("input=cloud.ply", "output=dense.ply")
+BAD = {
+    "no file": (("input=no.ply", "output=dense.ply"), "no.ply: no such file; give the path of a point cloud"),
+    "empty": (("input=empty.ply", "output=dense.ply"), "empty.ply: the file is empty; expected a point cloud"),
+    "suffix": (
+        ("input=cloud.ply", "output=dense.las"),
+        "dense.las: the suffix '.las' is not a format of a point cloud",
+    ),
+    "folder": (("input=cloud.ply", "output=no/dense.ply"), "no/dense.ply: the folder no does not exist; create it"),
+    "columns": (("input=five.txt", "output=dense.ply"), "five.txt: has 5 columns; expected 3 (x y z) or 6"),
+    "words": (("input=words.txt", "output=dense.ply"), "words.txt: line 1: expected numbers, found 'some'"),
+    "zero normals": (("input=zero.npy", "output=dense.ply"), "zero.npy: 20 of 20 normals have length zero"),
+    "same": (("input=cloud.ply", "output=./cloud.ply"), "output=./cloud.ply: is the input; give another name"),
+    "ratio": ((*GOOD, "ratio=0.5"), "ratio=0.5: expected a number >= 1, the points out for each point in"),
+    "ratio text": ((*GOOD, "ratio=many"), "ratio=many: expected float"),
+    "normals": ((*GOOD, "normals=maybe"), "normals=maybe: expected auto or estimate"),
+    "key": ((*GOOD, "ratoi=2"), "unknown key 'ratoi': did you mean 'ratio'?"),
+    "missing": (("input=cloud.ply",), "output=... is required"),
+    "no run": ((*GOOD, "run=nowhere"), "run: expected a run folder, such as outputs/<date>/<time>_<name>"),
+    "not a run": ((*GOOD, "run=outputs"), "run: expected a run folder with a config.yaml, found none in outputs"),
+    "device": ((*GOOD, "device=tpu"), "device=tpu: is not here; expected auto, cpu, or cuda"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    place: Path, case: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from pnu.upsample import main
+
+    (place / "empty.ply").touch()
+    np.savetxt(place / "five.txt", np.ones((20, 5)))
+    (place / "words.txt").write_text("some words\n" * 20)
+    np.save(place / "zero.npy", np.hstack([np.random.default_rng(0).normal(size=(20, 3)), np.zeros((20, 3))]))
+    before = {path: path.stat().st_mtime_ns for path in place.rglob("*") if path.is_file()}
+    arguments, message = BAD[case]
+    monkeypatch.chdir(place)
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 2
+    text = capsys.readouterr().err.strip()
+    assert "\n" not in text
+    assert text.startswith(f"error: {message}")
+    assert before == {path: path.stat().st_mtime_ns for path in place.rglob("*") if path.is_file()}
+
+
+def test_bad_input_of_the_real_command(place: Path) -> None:
+    done = upsample(place, *GOOD, "ratio=0.5")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "error: ratio=0.5: expected a number >= 1, the points out for each point in\n"
+
+
+def test_no_run_at_all(tmp_path: Path) -> None:
+    write_cloud(tmp_path / "cloud.ply", np.random.default_rng(0).normal(size=(20, 3)))
+    done = upsample(tmp_path, *GOOD, "quiet=true")
+    assert done.returncode == 2
+    expected = "error: run: no finished run under outputs/; train one with `make train`, or give run=FOLDER\n"
+    assert (done.stdout, done.stderr) == ("", expected)
+    assert [path.name for path in tmp_path.iterdir()] == ["cloud.ply"]
+
+
+def test_help_names_every_key(tmp_path: Path) -> None:
+    done = upsample(tmp_path, "--help")
+    assert done.returncode == 0
+    for key in ("input=", "output=", "run=", "ratio=4", "normals=auto", "device=auto", "quiet=false"):
+        assert key in done.stdout
