@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from os import PathLike
+from pathlib import Path
 from typing import Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -109,12 +110,18 @@ def output_count(n: int, ratio: float) -> int:
     return count
 
 
+def newest_run() -> Path:
+    """The run that finished last under outputs/; `ValueError` if there is none."""
+    run = checkpoint.newest_run()
+    if run is None:
+        raise ValueError("run: no finished run under outputs/; train one with `make train`, or give run=FOLDER")
+    return run
+
+
 def _on_device(model: nn.Module | str | PathLike[str] | None, device: str) -> tuple[nn.Module, torch.device]:
     """The network, and the device it now lies on."""
     if model is None:
-        model = checkpoint.newest_run()
-        if model is None:
-            raise ValueError("run: no finished run under outputs/; train one with `make train`, or give run=FOLDER")
+        model = newest_run()
     given = isinstance(model, nn.Module)
     network = model if isinstance(model, nn.Module) else checkpoint.load(model)
     if device != "auto":

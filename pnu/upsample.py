@@ -44,24 +44,21 @@ def upsample(cfg: Any) -> None:
     if Path(cfg.output).resolve() == Path(cfg.input).resolve():
         raise ValueError(f"output={cfg.output}: is the input; give another name")
     cloud = io.read_cloud(cfg.input, normals=cfg.normals == "auto")
-    origin = "with normals" if cloud.normals is not None else "without normals: estimated and oriented"
-    say(f"input:  {cfg.input}, {len(cloud.points)} points {origin}")
+    origin = "with normals" if cloud.normals is not None else "normals estimated and oriented"
+    say(f"input:  {cfg.input}, {len(cloud.points)} points, {origin}")
     if cloud.attributes:
         say(f"        left out: {', '.join(cloud.attributes)} (points and normals are upsampled, nothing else)")
 
-    from pnu import checkpoint, inference
+    from pnu import inference
 
-    run = cfg.run or checkpoint.newest_run()
-    if run is None:
-        raise ValueError("run: no finished run under outputs/; train one with `make train`, or give run=FOLDER")
+    run = cfg.run or inference.newest_run()
     say(f"run:    {run}{'' if cfg.run else ' (the newest finished one)'}")
-    network = checkpoint.load(run)
     with progress_bar(cfg.quiet) as progress:
         dense = inference.upsample(
             cloud.points,
             cloud.normals,
             ratio=cfg.ratio,
-            model=network,
+            model=run,
             patch_size=cfg.patch_size,
             device=cfg.device,
             batch_size=cfg.batch_size,
@@ -83,9 +80,10 @@ def progress_bar(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
     with Progress(console=Console(stderr=True), disable=quiet) as bar:
 
         def progress(stage: str, done: int, total: int) -> None:
+            known = total if total > 1 or done else None  # a single step has no middle to show
             if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=total)
-            bar.update(tasks[stage], completed=done, total=total)
+                tasks[stage] = bar.add_task(stage, total=known)
+            bar.update(tasks[stage], completed=done, total=known)
 
         yield progress
 

@@ -51,7 +51,7 @@ def test_newest_run_and_report(place: Path) -> None:
     np.testing.assert_allclose(np.linalg.norm(np.loadtxt(place / "dense.xyz")[:, 3:], axis=1), 1, atol=1e-6)
     assert np.abs(dense.points.mean(0) - 1e6).max() < 100
     lines = done.stdout.splitlines()
-    assert lines[0] == "input:  cloud.ply, 200 points with normals"
+    assert lines[0] == "input:  cloud.ply, 200 points, with normals"
     assert lines[1] == "run:    outputs/2026-01-02/03-04-05_small (the newest finished one)"
     assert lines[2].startswith("output: dense.xyz, 700 points with unit normals, ")
     assert lines[3] == "next:   python -m pnu.reconstruct input=dense.xyz output=mesh.ply"
@@ -64,7 +64,7 @@ def test_given_run_quiet_and_estimated_normals(place: Path) -> None:
     np.save(place / "points.npy", points)
     write_cloud(place / "inward.ply", points, -normals, {"colors": np.zeros((200, 3), np.uint8)})
     done = upsample(place, "input=points.npy", "output=a.npy", f"run={run}", "ratio=2")
-    assert "input:  points.npy, 200 points without normals: estimated and oriented" in done.stdout
+    assert "input:  points.npy, 200 points, normals estimated and oriented" in done.stdout
     assert f"run:    {run}\n" in done.stdout
     done = upsample(
         place, "input=inward.ply", "output=b.npy", f"run={run}", "ratio=2", "normals=estimate", "quiet=true"
