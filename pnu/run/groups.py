@@ -69,6 +69,12 @@ class Loss:
     w5: float = doc("weight of normal_knn: normals of neighbours alike (Eq. 6)")
     k: int = doc("neighbours of the three neighbourhood terms")
     reduction: str = doc("mean (released code) or sum (the paper's equations)")
+    point_term: str = doc("of w1: chamfer, or emd (Eq. 2, many times slower)")
+    point_knn_in: str = doc("where point_knn takes neighbours: prediction (released code) or target (Eq. 3)")
+    normal_pairs: str = doc("target: each with its nearest prediction (released code); prediction: the other way")
+    orth: str = doc("cosine of normal_orth: absolute (released code) or signed (Eq. 5)")
+    unit_normals: bool = doc("normalise predicted normals before the loss; the released code does not")
+    near_ties: str = doc("of the nearest prediction: released (its rounding decides) or exact")
 
 
 @dataclass
