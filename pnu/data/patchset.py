@@ -89,7 +89,7 @@ def build(
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         file.attrs["parameters"] = json.dumps(dict(parameters or {}), sort_keys=True)
         clouds = file.create_dataset("poisson_4096", (patches, PATCH_POINTS, 6), "f4", chunks=(1, PATCH_POINTS, 6))
-        edges = file.create_dataset("edges", (patches, EDGE_POINTS, 3), "f4", chunks=(16, EDGE_POINTS, 3))
+        edges = file.create_dataset("edges", (patches, EDGE_POINTS, 3), "f4", chunks=(1, EDGE_POINTS, 3))
         name_of = file.create_dataset("name", (patches,), text)
         row = 0
         results: Iterable[Any] = results_of(jobs, processes)

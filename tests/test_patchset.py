@@ -1,0 +1,135 @@
+"""Patch files: what is cut, what is written, what is refused."""
+
+import functools
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from pnu.data import shapes
+from pnu.data.patchset import build, check, cut_patches, describe
+from pnu.ops.surface import closest_points, face_normals
+
+MAKERS = {name: functools.partial(shapes.make, name) for name in ("washer", "dice")}
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("patches") / "two.h5"
+    build(path, MAKERS, 5, parameters={"source": "test"})
+    return path
+
+
+def test_patches_lie_on_the_surface_with_its_normals() -> None:
+    mesh = shapes.make("dice")
+    made = cut_patches(mesh, 3, np.random.default_rng(0))
+    assert made.clouds.shape == (3, 4096, 6)
+    assert made.clouds.dtype == np.float32
+    for cloud in made.clouds:
+        _, distance, face = closest_points(mesh, cloud[::40, :3].astype(float))
+        assert distance.max() < 1e-6
+        cosine = (face_normals(mesh)[face] * cloud[::40, 3:]).sum(1)
+        assert np.mean(cosine > 0.999) > 0.95  # the others lie on an edge, where two faces are closest
+
+
+def test_points_are_even_and_patches_connected_in_space() -> None:
+    cloud = cut_patches(shapes.make("washer"), 1, np.random.default_rng(0)).clouds[0, :, :3]
+    spacing = cKDTree(cloud).query(cloud, 2)[0][:, 1]
+    assert spacing.std() / spacing.mean() < 0.25  # random points have 0.52
+    center = cloud[np.linalg.norm(cloud - cloud.mean(0), axis=1).argmin()]
+    assert np.linalg.norm(cloud - center, axis=1).max() < 1.2
+
+
+def test_edges_lie_beside_the_patch() -> None:
+    made = cut_patches(shapes.make("star_prism"), 4, np.random.default_rng(0))
+    for cloud, edges in zip(made.clouds, made.edges, strict=True):
+        edges = edges[np.isfinite(edges[:, 0])]
+        assert len(edges) > 10
+        assert cKDTree(cloud[:, :3]).query(edges)[0].max() < 0.05
+    assert np.isnan(cut_patches(shapes.make("pillow"), 1, np.random.default_rng(0)).edges).all()
+
+
+def test_file_has_the_documented_datasets(file: Path) -> None:
+    with h5py.File(file) as opened:
+        assert opened["poisson_4096"].shape == (5, 4096, 6)
+        assert opened["poisson_4096"].dtype == np.float32
+        assert [name.decode() for name in opened["name"][()]] == ["dice"] * 3 + ["washer"] * 2
+        length = np.linalg.norm(opened["poisson_4096"][:, :, 3:], axis=-1)
+    assert np.allclose(length, 1, atol=1e-5)
+    contents = check(file)
+    assert (contents.patches, contents.points, contents.has_edges, contents.has_input) == (5, 4096, True, False)
+    assert contents.parameters == {"source": "test"}
+
+
+def test_same_patches_with_two_processes(file: Path, tmp_path: Path) -> None:
+    build(tmp_path / "again.h5", MAKERS, 5, processes=2)
+    with h5py.File(file) as one, h5py.File(tmp_path / "again.h5") as two:
+        assert np.array_equal(one["poisson_4096"][()], two["poisson_4096"][()])
+        assert np.array_equal(one["edges"][()], two["edges"][()], equal_nan=True)
+
+
+def test_failure_leaves_no_file(tmp_path: Path) -> None:
+    def broken() -> None:
+        raise ValueError("no faces")
+
+    with pytest.raises(ValueError, match="^zebra: no faces$"):
+        build(tmp_path / "out.h5", {"dice": MAKERS["dice"], "zebra": broken}, 2)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_describe(file: Path) -> None:
+    figures = describe(file)
+    assert (figures["patches"], figures["shapes"], figures["points"]) == (5, 2, 4096)
+    assert 0.01 < figures["spacing_over_radius"] < 0.05
+    assert figures["share_with_sharp_edges"] == 1
+
+
+def cloud(n: int = 2, points: int = 128) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(n, points, 3))
+    return np.concatenate([rng.random((n, points, 3)), normals / np.linalg.norm(normals, axis=-1, keepdims=True)], -1)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({}, r"lacks the dataset poisson_4096 \(patches, points, 6\); it has nothing"),
+        ({"montecarlo_5k": cloud()}, r"lacks the dataset poisson_4096 .* it has montecarlo_5k \(2, 128, 6\)"),
+        ({"poisson_4096": cloud()[..., :3]}, r"must have shape .*, found \(2, 128, 3\)"),
+        ({"poisson_4096": cloud(points=20)}, r"must have shape .*, found \(2, 20, 6\)"),
+        ({"poisson_4096": cloud()[0]}, r"must have shape .*, found \(128, 6\)"),
+        ({"poisson_4096": (9 * cloud()).astype(int)}, "must hold floating-point numbers, found int64"),
+        ({"poisson_4096": np.where(cloud() > 0.9, np.nan, cloud())}, "holds NaN or infinity"),
+        ({"poisson_4096": cloud() * 2}, "must be unit normals, found lengths 2 to 2"),
+        (
+            {"poisson_4096": cloud(), "name": [b"a"]},
+            r"name must have one entry for each of the 2 patches, found \(1,\)",
+        ),
+        ({"poisson_4096": cloud(), "montecarlo_1024": cloud(3)}, r"montecarlo_1024 must have shape \(2, points, 6\)"),
+        ({"poisson_4096": cloud(), "edges": cloud()}, r"edges must have shape \(2, points, 3\)"),
+    ],
+)
+def test_foreign_file_is_refused_with_what_it_lacks(tmp_path: Path, content: dict, message: str) -> None:
+    path = tmp_path / "foreign.h5"
+    with h5py.File(path, "w") as opened:
+        for name, value in content.items():
+            opened[name] = value
+    with pytest.raises(ValueError, match=message) as raised:
+        check(path)
+    assert str(raised.value).startswith(str(path))
+    assert "\n" not in str(raised.value)
+
+
+def test_no_file_and_no_hdf5(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no such file"):
+        check(tmp_path / "none.h5")
+    (tmp_path / "text.h5").write_text("not a file of patches")
+    with pytest.raises(ValueError, match="expected an HDF5 file of patches"):
+        check(tmp_path / "text.h5")
+
+
+def test_too_few_patches() -> None:
+    with pytest.raises(ValueError, match="at least one for each of the 2 shapes, found 1"):
+        build("never.h5", MAKERS, 1)
