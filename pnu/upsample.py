@@ -77,15 +77,20 @@ def progress_bar(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
     from rich.progress import Progress, TaskID
 
     tasks: dict[str, TaskID] = {}
-    with Progress(console=Console(stderr=True), disable=quiet) as bar:
+    bar = Progress(console=Console(stderr=True), disable=quiet)
 
-        def progress(stage: str, done: int, total: int) -> None:
-            known = total if total > 1 or done else None  # a single step has no middle to show
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=known)
-            bar.update(tasks[stage], completed=done, total=known)
+    def progress(stage: str, done: int, total: int) -> None:
+        known = total if total > 1 or done else None  # a single step has no middle to show
+        if stage not in tasks:
+            bar.start()  # not before: an error that comes first stands alone
+            tasks[stage] = bar.add_task(stage, total=known)
+        bar.update(tasks[stage], completed=done, total=known)
 
+    try:
         yield progress
+    finally:
+        if tasks:
+            bar.stop()
 
 
 class _Callable(types.ModuleType):

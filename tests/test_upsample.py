@@ -128,6 +128,12 @@ def test_bad_input_of_the_real_command(place: Path) -> None:
     assert done.stderr == "error: ratio=0.5: expected a number >= 1, the points out for each point in\n"
 
 
+def test_no_bar_before_an_error(place: Path) -> None:
+    done = upsample(place, *GOOD, "run=outputs")
+    assert done.returncode == 2
+    assert done.stderr == "error: run: expected a run folder with a config.yaml, found none in outputs\n"
+
+
 def test_no_run_at_all(tmp_path: Path) -> None:
     write_cloud(tmp_path / "cloud.ply", np.random.default_rng(0).normal(size=(20, 3)))
     done = upsample(tmp_path, *GOOD, "quiet=true")
