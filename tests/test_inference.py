@@ -257,7 +257,7 @@ BAD = {
     "device": ({"device": "tpu"}, "^device=tpu: is not here; expected auto, cpu, or cuda"),
     "batch": ({"batch_size": 0}, "^batch_size=0: expected a whole number >= 1"),
     "patch": ({"patch_size": -1}, "^patch_size=-1: expected a whole number >= 1"),
-    "run": ({"model": "nowhere"}, "expected a run folder.*found no folder nowhere"),
+    "run": ({"model": "nowhere"}, "expected a run folder.*found no folder"),
     "prediction": ({"model": Spread(step=float("nan"))}, "^model: predicted points that are NaN or infinite"),
 }
 
