@@ -2,7 +2,8 @@
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,7 +55,9 @@ def reconstruct(cfg: Any) -> None:
         from pnu.ops.normals import estimate_normals
 
         normals = estimate_normals(torch.from_numpy(points)[None])[0].numpy()
-    surface = surfaces.reconstruct(points, normals, depth=cfg.depth, timeout=cfg.timeout, name=cfg.input)
+    depth = surfaces.octree_depth(points) if cfg.depth is None else cfg.depth
+    with busy(f"Poisson reconstruction, depth {depth}", cfg.quiet):
+        surface = surfaces.reconstruct(points, normals, depth=depth, timeout=cfg.timeout, name=cfg.input)
     for text in surface.warnings():
         warn(text)
     if cfg.trim:
@@ -67,10 +70,11 @@ def reconstruct(cfg: Any) -> None:
     if truth is not None:
         errors = surfaces.surface_errors(mesh, truth, rng=np.random.default_rng(cfg.seed))
         extra = {"quality": errors.distance, "colors": errors.colors(cfg.limit, cfg.colormap)}
+    io.write_mesh(cfg.output, mesh, vertex_normals=vertex_normals(mesh), **extra)
+    if truth is not None:
         report = cfg.report or str(Path(cfg.output).with_suffix(".json"))
         io.write_json(report, {"input": cfg.input, "truth": cfg.truth, "depth": surface.depth} | errors.summary())
         say(f"{errors.table()}\nreport: {report}")
-    io.write_mesh(cfg.output, mesh, vertex_normals=vertex_normals(mesh), **extra)
     counts = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces, depth {surface.depth}"
     say(f"output: {cfg.output}, {counts}, {time.perf_counter() - started:.1f} s")
     say(f"next:   python -m pnu.picture inputs=[{cfg.input},{cfg.output}] output=picture.png")
@@ -94,6 +98,19 @@ def check(cfg: Any) -> None:
     if Path(cfg.output).resolve() == Path(cfg.input).resolve():
         raise ValueError(f"output={cfg.output}: is the input; give another name")
     check_writable(cfg.output)
+
+
+@contextmanager
+def busy(text: str, quiet: bool) -> Iterator[None]:
+    """A sign of life with the seconds so far, on a terminal; the child tells no progress."""
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal) as bar:
+        bar.add_task(text, total=None)
+        yield
 
 
 def warn(text: str) -> None:

@@ -103,7 +103,7 @@ def test_viewer_gets_what_was_given() -> None:
     assert stored["limit"] == "20"
     surface = given.drawings[1].surface
     assert surface is not None
-    index = array(ours["surface"]["index"], "<u4").reshape(-1, 3)
+    index = np.cumsum(array(ours["surface"]["index"], "<i4")).reshape(-1, 3)
     position = (array(ours["surface"]["position"], "<u2").reshape(-1, 3) / 65535 * 2 - 1) * RANGE * 5 + given.center
     np.testing.assert_allclose(position[index], surface.vertices[surface.faces], atol=5e-4)
     np.testing.assert_array_equal(array(ours["surface"]["error"], "u1"), 128)

@@ -112,7 +112,10 @@ class Viewer {
         normal: { size: 3, data: part.normal ? array(Int8Array, part.normal) : new Int8Array(part.position[1]), type: this.gl.BYTE, normalized: true },
         error: { size: 1, data: part.error ? array(Uint8Array, part.error) : new Uint8Array(part.position[1] / 3), type: this.gl.UNSIGNED_BYTE, normalized: true },
       };
-      if (part.index) attributes.index = { data: array(Uint32Array, part.index) };
+      if (part.index) { // stored as differences
+        let sum = 0;
+        attributes.index = { data: Uint32Array.from(array(Int32Array, part.index), (step) => (sum += step)) };
+      }
       const made = new OGL.Geometry(this.gl, attributes);
       const mesh = new OGL.Mesh(this.gl, {
         geometry: made, program: this.program, mode: part.index ? this.gl.TRIANGLES : this.gl.POINTS, frustumCulled: false,

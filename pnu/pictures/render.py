@@ -43,7 +43,7 @@ def render_cloud(
     center = project(camera, points, pixels)
     step = spacing(points) / camera.half_size * pixels / 2
     ball = 0.4 * step if radius is None else radius / camera.half_size * pixels / 2
-    ball = max(ball, 0.7 * supersample)
+    ball = max(ball, 0.9 * supersample)
     keep = np.flatnonzero(in_front(center, 2 * step, pixels)) if hide else np.arange(len(points))
     found = raster.balls(center[keep], ball, pixels, pixels)
     owner = keep[found.primitive]
