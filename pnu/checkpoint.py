@@ -7,18 +7,23 @@
 Checkpoints are read with `weights_only=True`: tensors and plain types, never code.
 """
 
+import datetime
 import json
 import pickle
+import shutil
+import uuid
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import yaml
 from torch import Tensor, nn
 
 from pnu import models
+from pnu.io import write_json
 
 PREFIX = "model."
 
@@ -31,7 +36,7 @@ def load(source: str | PathLike[str]) -> nn.Module:
     """
     folder = Path(source)
     if not folder.is_dir():
-        raise ValueError(f"run: expected a run folder, such as outputs/<date>/<time>_<name>, found no folder {folder}")
+        raise ValueError(f"run={folder}: expected a run folder, such as outputs/<date>/<time>_<name>, found no folder")
     network = models.build(model_config(folder))
     path = checkpoint_path(folder)
     state = read(path).get("state_dict")
@@ -45,11 +50,11 @@ def model_config(folder: Path) -> dict[str, Any]:
     """The group `model` of a run folder's config.yaml."""
     path = folder / "config.yaml"
     if not path.is_file():
-        raise ValueError(f"run: expected a run folder with a config.yaml, found none in {folder}")
+        raise ValueError(f"run={folder}: expected a run folder with config.yaml, found none")
     try:
         config = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: expected YAML, found {' '.join(str(error).split())}") from error
+        raise ValueError(f"{path}: is not YAML ({' '.join(str(error).split())}); restore or remove it") from error
     if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
         raise ValueError(f"{path}: expected a group 'model' with the network's _target_ and arguments, found none")
     return config["model"]
@@ -60,16 +65,20 @@ def checkpoint_path(folder: Path) -> Path:
     for name in ("best.ckpt", "last.ckpt"):
         if (path := folder / "checkpoints" / name).is_file():
             return path
-    raise ValueError(f"{folder}: expected checkpoints/best.ckpt or checkpoints/last.ckpt, found neither")
+    raise ValueError(f"run={folder}: expected checkpoints/best.ckpt or checkpoints/last.ckpt, found neither")
 
 
 def read(path: str | PathLike[str]) -> dict[str, Any]:
-    """A checkpoint's dict, read as tensors and plain types; ValueError if it is anything else."""
+    """A checkpoint's dict, read as tensors, plain types and NumPy scalars; ValueError if it holds anything else."""
+    scalar = np.float64(0).__reduce__()[0]  # what a pickled NumPy scalar calls
+    numbers: list[Any] = [(scalar, "numpy.core.multiarray.scalar"), scalar, np.dtype]
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError) as error:
-        reason = str(error).strip().split("\n")[0] or type(error).__name__
-        raise ValueError(f"{path}: expected a checkpoint of tensors and plain types, found {reason}") from error
+        with torch.serialization.safe_globals([*numbers, *{type(np.dtype(kind)) for kind in "fdilq"}]):
+            content = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, LookupError) as error:
+        raise ValueError(
+            f"{path}: expected a checkpoint of tensors and plain types, found a file that is broken or holds other objects"
+        ) from error
     if not isinstance(content, dict):
         raise ValueError(f"{path}: expected a checkpoint with a dict, found {type(content).__name__}")
     return content
@@ -81,22 +90,52 @@ def fill(network: nn.Module, state: Mapping[str, Tensor], source: str | PathLike
     found = {name: tuple(value.shape) for name, value in state.items()}
     for name in [*own, *found]:
         if own.get(name) != found.get(name):
-            ours, theirs = own.get(name, "nothing"), found.get(name, "nothing")
-            raise ValueError(
-                f"{source}: expected the state of {type(network).__name__} as in config.yaml, "
-                f"found another one's: {name} is {theirs} instead of {ours}"
-            )
+            is_, should = found.get(name, "missing"), own.get(name, "unknown")
+            expected = f"expected the state of {type(network).__name__} with the arguments of its config"
+            raise ValueError(f"{source}: {expected}, found another network's: {name} is {is_}, not {should}")
     network.load_state_dict(dict(state))
 
 
+def save(folder: Path, network: nn.Module, config: Mapping[str, Any], record: Mapping[str, Any]) -> None:
+    """Make a finished run folder of a network that was not trained here; it appears whole or not at all.
+
+    Args:
+        folder: must not exist; its parent must.
+        network: of the class and arguments in `config`.
+        config: group `model` of the run's config.yaml.
+        record: what run.json says beside status and ratio.
+    """
+    temporary = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:12]}")
+    try:
+        (temporary / "checkpoints").mkdir(parents=True)
+        (temporary / "config.yaml").write_text(yaml.safe_dump({"model": dict(config)}), encoding="utf-8")
+        state = {PREFIX + name: value for name, value in network.state_dict().items()}
+        torch.save({"state_dict": state}, temporary / "checkpoints" / "best.ckpt")
+        write_json(temporary / "run.json", {"status": "finished", "ratio": network.ratio, **record})
+        temporary.rename(folder)
+    except OSError as error:
+        raise ValueError(f"{folder}: cannot be written ({error.strerror}); choose another folder") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
 def newest_run(root: str | PathLike[str] = "outputs") -> Path | None:
-    """The run below `root` that finished last, or None."""
+    """The run below `root` that ended last of those that finished, or None."""
     finished = []
     for path in Path(root).rglob("run.json"):
         try:
-            status = json.loads(path.read_text(encoding="utf-8")).get("status")
-        except (OSError, ValueError, AttributeError):
+            record = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
             continue
-        if status == "finished" and any((path.parent / "checkpoints").glob("*.ckpt")):
-            finished.append((path.stat().st_mtime_ns, path.parent))
-    return max(finished)[1] if finished else None
+        whole = (path.parent / "config.yaml").is_file() and any((path.parent / "checkpoints").glob("*.ckpt"))
+        if whole and isinstance(record, dict) and record.get("status") == "finished":
+            finished.append((_ended(record, path), str(path.parent), path.parent))
+    return max(finished)[2] if finished else None
+
+
+def _ended(record: Mapping[str, Any], path: Path) -> float:
+    """When a run ended, in seconds since 1970: as its record says, or else when that was written."""
+    try:
+        return datetime.datetime.fromisoformat(str(record.get("ended"))).timestamp()
+    except ValueError:
+        return path.stat().st_mtime

@@ -35,8 +35,8 @@ def from_released(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     ours = {}
     for name, value in state.items():
         if not isinstance(value, Tensor):
-            raise ValueError(f"released state: expected a tensor for {name!r}, found {type(value).__name__}")
-        new = rename(name)
+            raise ValueError(f"expected a tensor for {name!r}, found {type(value).__name__}")
+        new = rename(name.removeprefix("module."))  # of DataParallel
         if new.endswith("linear.weight") or new == "regression.weight":
             value = value.flatten(1)
         if new.startswith(_SPLIT) and value.ndim:
@@ -62,4 +62,4 @@ def rename(name: str) -> str:
             return f"{_UPSAMPLING[number]}.linear.{match[2]}"
         if number - 1 in _UPSAMPLING:
             return f"{_UPSAMPLING[number - 1]}.norm.{match[2]}"
-    raise ValueError(f"released state: expected the names of the released network, found {name!r}")
+    raise ValueError(f"expected the names of the released network, found {name!r}")
