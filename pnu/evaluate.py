@@ -1,0 +1,118 @@
+"""Measure a trained network, or a classical method, on whole clouds: `python -m pnu.evaluate run=FOLDER`."""
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pnu.run import command, doc
+from pnu.run.groups import Data
+
+NORMALS = {"given": "as given", "estimate": "estimated"}
+SETTINGS = ("ratio", "points", "truth_points", "normals", "search", "passes", "seed")
+
+
+@dataclass
+class Evaluate:
+    """Upsample whole clouds of several kinds, measure the results against the true surfaces, and write tables."""
+
+    run: str | None = doc("run folder with the network; null: the newest finished one under outputs/, or `method`")
+    method: str | None = doc("upsampler without training instead of a run: apss, poisson or midpoint")
+    data: Data = doc("synthetic, or meshes with data.root=FOLDER: meshes, or prepared pairs in clouds/ and truth/")
+    part: str | None = doc("of the shapes: train, val, test, all; null: test of the procedural ones, all of a folder")
+    shapes: list[str] | None = doc("names of the shapes to take; null: all of the part")
+    kinds: list[str] = doc(
+        "of input: uniform, random, nonuniform, sparse (a quarter of the points), noise_0.5, noise_1"
+    )
+    points: int = doc("points of an input cloud")
+    truth_points: int = doc("points on the true surface to compare with")
+    ratio: float = doc("points out for each point in")
+    passes: bool = doc("also where the network was trained for another ratio: by passes and farthest points")
+    normals: str = doc("of the inputs. given: those of the surface or file; estimate: estimated from the points")
+    search: str = doc("for closest surface points. exact; open3d: as other scripts (differs in the faces at edges)")
+    output: str | None = doc("folder for metrics.json and metrics.csv; null: evaluation/ in the run, or in outputs/")
+    save: bool = doc("write the upsampled clouds too, to the folder's clouds/")
+    patch_size: int | None = doc("points of a patch; null: what the network was made for")
+    batch_size: int | None = doc("patches at once, bounds the memory; null: by the device")
+    device: str = doc("auto, cpu, cuda, cuda:1 ...")
+    seed: int = doc("of all that is drawn")
+    quiet: bool = doc("print nothing but warnings and errors")
+
+
+def evaluate(cfg: Any) -> None:
+    check(cfg)
+    from pnu import checkpoint, classical, evaluation, inference, io
+    from pnu.metrics import raycast
+    from pnu.ops.surface import closest_points
+
+    source = evaluation.source(
+        cfg.data, cfg.kinds, part=cfg.part, only=cfg.shapes, points=cfg.points, truth_points=cfg.truth_points,
+        seed=cfg.seed, normals=cfg.normals == "given", warn=warn,
+    )  # fmt: skip
+    subject = cfg.method or str(cfg.run or inference.newest_run())
+    model = classical.method(subject) if cfg.method else checkpoint.load(subject)
+    upsampler = evaluation.network_upsampler(
+        model, cfg.ratio, passes=cfg.passes, name=subject, patch_size=cfg.patch_size, batch_size=cfg.batch_size,
+        device=cfg.device, seed=cfg.seed,
+    )  # fmt: skip
+    default = Path("outputs", "evaluation", subject) if cfg.method else Path(subject, "evaluation")
+    output = evaluation.result_folder(cfg.output or default / source.name)
+    clouds = evaluation.result_folder(output / "clouds") if cfg.save else None
+
+    def keep(case: evaluation.Case, method: str, cloud: Any) -> None:
+        if clouds:
+            io.write_cloud(clouds / f"{case.truth.shape}_{case.kind}.ply", cloud[:, :3], cloud[:, 3:])
+
+    with progress_bar(2 * len(source.shapes) * len(source.kinds), cfg.quiet) as step:
+        closest = raycast.closest_points if cfg.search == "open3d" else closest_points
+        name = Path(subject).name
+        rows = list(
+            evaluation.evaluate(
+                {name: upsampler}, source.cases, ratio=cfg.ratio, seed=cfg.seed, closest=closest, keep=keep, step=step
+            )
+        )
+    head = {key: cfg[key] for key in SETTINGS} | {"subject": subject, "data": source.name}
+    evaluation.write_results(output, rows, head)
+    if not cfg.quiet:
+        evaluation.print_tables(rows, f"{subject}, normals of the input {NORMALS[cfg.normals]}")
+        print(f"output: {output}/metrics.json, metrics.csv{', clouds/' if cfg.save else ''}")
+        print(f"next:   python -m pnu.compare methods=[{subject},{'poisson' if cfg.method == 'apss' else 'apss'}]")
+
+
+def check(cfg: Any) -> None:
+    """Refuse what can be refused before anything is loaded."""
+    for key, known in (("normals", tuple(NORMALS)), ("search", ("exact", "open3d"))):
+        if cfg[key] not in known:
+            raise ValueError(f"{key}={cfg[key]}: expected {' or '.join(known)}")
+    if cfg.run and cfg.method:
+        raise ValueError(f"run={cfg.run} and method={cfg.method}: expected one of them; pnu.compare takes several")
+    if not 1 <= cfg.ratio < float("inf"):
+        raise ValueError(f"ratio={cfg.ratio:g}: expected a number >= 1, the points out for each point in")
+
+
+def warn(text: str) -> None:
+    print(f"warning: {text}", file=sys.stderr)
+
+
+@contextmanager
+def progress_bar(total: int, quiet: bool) -> Iterator[Callable[[str], None]]:
+    """A bar on stderr with the time left; the function it gives is told of each next step."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), disable=quiet, transient=True) as bar:
+        task = bar.add_task("", total=total)
+        done = iter(range(total + 1))
+
+        def step(text: str) -> None:
+            bar.update(task, description=text, completed=next(done, total))
+
+        yield step
+
+
+main = command(evaluate, Evaluate)
+
+if __name__ == "__main__":
+    main()

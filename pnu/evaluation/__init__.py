@@ -1,0 +1,29 @@
+"""Whole clouds measured against true surfaces: inputs of several kinds, any upsamplers, tables."""
+
+from pnu.evaluation.cases import KINDS, Case, Truth, mesh_cases, pair_cases, truth_of_mesh
+from pnu.evaluation.measure import Row, Upsampler, evaluate, measure, network_upsampler
+from pnu.evaluation.report import METRICS, legend, print_tables, result_folder, summarize, write_results
+from pnu.evaluation.sources import PARTS, Source, source
+
+__all__ = [
+    "KINDS",
+    "METRICS",
+    "PARTS",
+    "Case",
+    "Row",
+    "Source",
+    "Truth",
+    "Upsampler",
+    "evaluate",
+    "legend",
+    "measure",
+    "mesh_cases",
+    "network_upsampler",
+    "pair_cases",
+    "print_tables",
+    "result_folder",
+    "source",
+    "summarize",
+    "truth_of_mesh",
+    "write_results",
+]

@@ -1,0 +1,189 @@
+"""What is evaluated: true surfaces, and input clouds drawn from them or read beside them."""
+
+import zlib
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from pnu import surfaces
+from pnu.io import CLOUD_SUFFIXES, MESH_SUFFIXES, Mesh, read_cloud, read_mesh
+from pnu.ops.mesh import open_edges
+from pnu.ops.normalize import Frame, unit_sphere_frame
+from pnu.ops.sampling import nonuniform_points
+from pnu.ops.surface import sample_area, sample_poisson_disk
+
+KINDS = ("uniform", "random", "nonuniform", "sparse", "noise_0.5", "noise_1")
+"""Kinds of input: evenly spread (Poisson-disk), random by area, denser around three places, evenly spread with a
+quarter of the points, evenly spread with Gaussian noise of 0.5 % and 1 % of the radius in each coordinate."""
+
+STRENGTH, CENTERS, CANDIDATES = 2.0, 3, 4  # nonuniform: e^2 times denser, around 3 points, out of 4 times as many
+UNIT = 0.01  # a truth whose radius about the origin differs from 1 by less is taken as it is
+
+Warn = Callable[[str], None]
+
+
+class Truth(NamedTuple):
+    """A true surface in the frame of the comparison, where its radius is 1."""
+
+    shape: str
+    mesh: Mesh | None
+    samples: np.ndarray  # (m, 6) evenly spread points with normals, or (m, 3) without
+    frame: str  # the frame in words
+
+
+class Case(NamedTuple):
+    """An input cloud, and the surface that it was drawn from."""
+
+    kind: str
+    points: np.ndarray  # (n, 3)
+    normals: np.ndarray | None  # (n, 3)
+    truth: Truth
+
+
+def mesh_cases(
+    meshes: Mapping[str, Callable[[], Mesh]],
+    kinds: Sequence[str] = KINDS,
+    *,
+    points: int = 5000,
+    truth_points: int = 20000,
+    seed: int = 0,
+    normals: bool = True,
+    warn: Warn = print,
+) -> Iterator[Case]:
+    """Inputs of all kinds from each mesh, brought to its unit sphere; drawn by (seed, shape, kind) alone.
+
+    normals: with the true normals of the surface (also beside noisy points), or without.
+    """
+    for shape, make in meshes.items():
+        truth = truth_of_mesh(shape, make(), truth_points, seed, warn=warn)
+        for kind in kinds:
+            cloud = draw_input(truth, kind, points, generator(seed, shape, kind))
+            yield Case(kind, cloud[:, :3], cloud[:, 3:] if normals else None, truth)
+
+
+def draw_input(truth: Truth, kind: str, n: int, rng: np.random.Generator) -> np.ndarray:
+    """An input of one of `KINDS` with the surface's normals, (n, 6); (n // 4, 6) if sparse."""
+    assert truth.mesh is not None
+    if kind == "random":
+        return sample_area(truth.mesh, n, rng)
+    if kind == "nonuniform":
+        dense = sample_area(truth.mesh, CANDIDATES * n, rng)
+        draws = torch.Generator().manual_seed(int(rng.integers(2**62)))
+        places = torch.from_numpy(dense[None, :, :3])
+        idx = nonuniform_points(places, n, strength=STRENGTH, centers=CENTERS, generator=draws)
+        return dense[idx[0].numpy()]
+    cloud = sample_poisson_disk(truth.mesh, n // 4 if kind == "sparse" else n, rng)
+    if kind.startswith("noise_"):
+        cloud[:, :3] += rng.normal(scale=float(kind.removeprefix("noise_")) / 100, size=(n, 3))
+    return cloud
+
+
+def truth_of_mesh(shape: str, mesh: Mesh, count: int, seed: int, *, warn: Warn = print) -> Truth:
+    """A mesh as truth, with `count` Poisson-disk samples, in the unit sphere of these."""
+    if holes := open_edges(mesh):
+        warn(f"{shape}: is not watertight ({holes} open edges); taken as an open surface")
+    samples = sample_poisson_disk(mesh, count, generator(seed, shape, "truth"))
+    frame, name = frame_of(samples)
+    return Truth(shape, moved_mesh(mesh, frame), moved(samples, frame), name)
+
+
+def pair_cases(
+    root: str | Path,
+    shapes: Collection[str] | None = None,
+    *,
+    truth_points: int = 20000,
+    seed: int = 0,
+    normals: bool = True,
+    warn: Warn = print,
+) -> Iterator[Case]:
+    """Prepared pairs of a folder: clouds/NAME.xyz (or ply ...) and truth/NAME.ply, the true mesh in the same frame.
+
+    truth/NAME_<count>.npy, where there is one, holds the evenly spread points of the truth, (count, 3 or 6); without a
+    mesh it is the truth. Both are brought to the truth's unit sphere if they are not in one.
+    """
+    for path in pair_files(root):
+        if shapes is not None and path.stem not in shapes:
+            continue
+        truth, frame = read_truth(Path(root) / "truth", path.stem, truth_points, seed, warn)
+        points, given, _ = read_cloud(path, normals=normals)
+        points = moved(points, frame)
+        check_frame(points, truth, path)
+        yield Case("given", points, given, truth)
+
+
+def read_truth(folder: Path, shape: str, count: int, seed: int, warn: Warn) -> tuple[Truth, Frame]:
+    meshes = [path for path in files(folder, MESH_SUFFIXES) if path.stem == shape]
+    samples = [path for path in files(folder, {".npy"}) if path.stem.rpartition("_")[0] == shape]
+    if not meshes and not samples:
+        raise ValueError(f"{folder}: expected {shape}.ply, the true mesh of clouds/{shape}, or {shape}_<count>.npy")
+    mesh = read_mesh(meshes[0]) if meshes else None
+    if mesh is not None and (holes := open_edges(mesh)):
+        warn(f"{meshes[0]}: is not watertight ({holes} open edges); taken as an open surface")
+    if samples:
+        cloud = read_cloud(samples[-1])
+        even = cloud.points if cloud.normals is None else np.hstack([cloud.points, cloud.normals])
+    else:
+        assert mesh is not None
+        even = sample_poisson_disk(mesh, count, generator(seed, shape, "truth"))
+    frame, name = frame_of(even)
+    return Truth(shape, mesh and moved_mesh(mesh, frame), moved(even, frame), name), frame
+
+
+def check_frame(points: np.ndarray, truth: Truth, path: Path) -> None:
+    """ValueError if the cloud does not lie on the truth: another frame, unit or shape."""
+    mesh = truth.mesh
+    if mesh is None:  # a triangle at each sample is surface enough for this
+        corners = truth.samples[:, None, :3] + 1e-3 * np.eye(3)
+        mesh = Mesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
+    surfaces.check_frame(points, mesh, name=str(path), truth_name=f"the truth of {truth.shape}")
+
+
+def pair_files(root: str | Path) -> list[Path]:
+    """The input clouds of a folder of prepared pairs."""
+    clouds = files(Path(root) / "clouds", CLOUD_SUFFIXES)
+    if not clouds:
+        raise ValueError(f"{root}/clouds: expected clouds ({', '.join(sorted(CLOUD_SUFFIXES))}), found none")
+    return clouds
+
+
+def is_pairs_folder(root: str | Path) -> bool:
+    """Whether a folder holds prepared pairs, in clouds/ and truth/."""
+    return (Path(root) / "clouds").is_dir() and (Path(root) / "truth").is_dir()
+
+
+def mesh_files(root: str | Path) -> dict[str, Path]:
+    """The meshes of a folder and its subfolders by name."""
+    root = Path(root)
+    if not root.is_dir():
+        raise ValueError(f"data.root={root}: no such folder; expected one with meshes, or with clouds/ and truth/")
+    found = sorted(path for path in root.rglob("*") if path.suffix.lower() in MESH_SUFFIXES)
+    if not found:
+        raise ValueError(f"data.root={root}: expected meshes ({', '.join(sorted(MESH_SUFFIXES))}), found none")
+    return {path.relative_to(root).with_suffix("").as_posix().replace("/", "_"): path for path in found}
+
+
+def generator(seed: int, shape: str, what: str) -> np.random.Generator:
+    """Randomness from the names alone, so that one shape's inputs do not depend on the others."""
+    return np.random.default_rng([seed, zlib.crc32(f"{shape}/{what}".encode())])
+
+
+def frame_of(samples: np.ndarray) -> tuple[Frame, str]:
+    """The truth's unit sphere: centroid and greatest distance of its samples, or as it is if that is one already."""
+    if abs(np.linalg.norm(samples[:, :3], axis=1).max() - 1) < UNIT:
+        return Frame(torch.zeros(1, 1, 3).double(), torch.ones(1, 1, 1).double()), "as given, a unit sphere"
+    return unit_sphere_frame(torch.from_numpy(samples[None].astype(np.float64))), "unit sphere of the truth"
+
+
+def moved(cloud: np.ndarray, frame: Frame) -> np.ndarray:
+    return frame.to_unit(torch.from_numpy(cloud[None].astype(np.float64)))[0].numpy()
+
+
+def moved_mesh(mesh: Mesh, frame: Frame) -> Mesh:
+    return Mesh(moved(mesh.vertices, frame), mesh.faces)
+
+
+def files(folder: Path, suffixes: Collection[str]) -> list[Path]:
+    return sorted(path for path in folder.glob("*") if path.suffix.lower() in suffixes)

@@ -1,0 +1,102 @@
+"""Run upsamplers on cases and measure what comes out."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from pnu import inference, metrics
+from pnu.evaluation.cases import Case, Truth, generator
+from pnu.evaluation.cost import Cost
+from pnu.metrics.functional import ClosestPoints
+from pnu.ops.normals import estimate_normals
+from pnu.ops.surface import closest_points, sample_poisson_disk
+
+Row = dict[str, Any]
+"""shape, kind, frame, method, points_in, points_out, and the metrics; lengths in the frame of the truth, not x 1e3."""
+
+Upsampler = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
+"""points (n, 3), normals (n, 3) or None -> cloud (m, 6)."""
+
+
+def evaluate(
+    methods: Mapping[str, Upsampler],
+    cases: Iterable[Case],
+    *,
+    ratio: float,
+    seed: int = 0,
+    closest: ClosestPoints = closest_points,
+    keep: Callable[[Case, str, np.ndarray], None] | None = None,
+    step: Callable[[str], None] = lambda text: None,
+) -> Iterator[Row]:
+    """Rows for each case: every method, then two to judge them by.
+
+    "input" is the input itself. "floor" is another Poisson-disk sampling of the true mesh with as many points as a
+    method gives: what perfect points on the true surface would score.
+    `keep` gets every cloud; `step` is told what comes next.
+    ValueError, naming method and shape, if a method gives another number of points than round(ratio n).
+    """
+    floors: dict[tuple[str, int], Row] = {}
+    for case in cases:
+        truth, head = case.truth, {"shape": case.truth.shape, "kind": case.kind, "frame": case.truth.frame}
+        wanted = round(ratio * len(case.points))
+        for name, upsample in methods.items():
+            step(f"{truth.shape}, {case.kind}: {name}")
+            with Cost() as cost:
+                cloud = upsample(case.points, case.normals)
+            if len(cloud) != wanted:
+                raise ValueError(f"{name}: gave {len(cloud)} points for {truth.shape}, expected {wanted}")
+            if keep:
+                keep(case, name, cloud)
+            counts = {"method": name, "points_in": len(case.points), "points_out": wanted}
+            yield head | counts | measure(cloud, truth, closest) | cost.values
+        step(f"{truth.shape}, {case.kind}: references")
+        if truth.mesh is not None:
+            key = truth.shape, wanted
+            if key not in floors:
+                other = sample_poisson_disk(truth.mesh, wanted, generator(seed, truth.shape, f"floor {wanted}"))
+                floors[key] = measure(other, truth, closest)
+            yield head | {"method": "floor", "points_in": 0, "points_out": wanted} | floors[key]
+        cloud = np.hstack([case.points, normals_of(case)])
+        counts = {"method": "input", "points_in": len(cloud), "points_out": len(cloud)}
+        yield head | counts | measure(cloud, truth, closest)
+
+
+def measure(cloud: np.ndarray, truth: Truth, closest: ClosestPoints = closest_points) -> dict[str, float]:
+    """All metrics of a cloud (m, 3 or 6) by name; those that the truth cannot tell are left out."""
+    result = metrics.compare(cloud, truth.samples)
+    if truth.mesh is not None:  # its normals count, not those of the nearest sample
+        result |= metrics.compare_mesh(cloud, truth.mesh, closest=closest)
+    return {name: float(value) for name, value in result.items()} | {
+        "uniformity": float(metrics.uniformity(cloud, truth.samples))
+    }
+
+
+def normals_of(case: Case) -> np.ndarray:
+    if case.normals is not None:
+        return case.normals
+    return estimate_normals(torch.from_numpy(case.points)[None])[0].numpy()
+
+
+def network_upsampler(
+    model: nn.Module, ratio: float, *, passes: bool = False, name: str = "run", **options: Any
+) -> Upsampler:
+    """A network, or a classical method, as an upsampler: through `pnu.upsample`, as users call it.
+
+    Raises:
+        ValueError: the network was trained for another ratio, and `passes` does not allow to reach this one by several
+            passes or by leaving points out.
+    """
+    trained = getattr(model, "ratio", None)
+    if not isinstance(model, inference.CloudUpsampler) and trained != ratio and not passes:
+        raise ValueError(
+            f"ratio={ratio:g}: {name} was trained for {trained}; give ratio={trained}, or passes=true to "
+            f"reach {ratio:g} by passes and farthest points"
+        )
+
+    def upsampler(points: np.ndarray, normals: np.ndarray | None) -> np.ndarray:
+        return inference.upsample(points, normals, ratio=ratio, model=model, **options)
+
+    return upsampler
