@@ -42,6 +42,13 @@ class Data:
     centers: int = doc("nonuniform: dense places of a patch")
     val_share: float = doc("share of the shapes kept for validation")
     test_share: float = doc("share of the shapes kept for the test")
+    procedural: bool = doc("train on the procedural shapes too (data=surface)")
+    validation: list[str] = doc("meshes kept for validation and test (data=surface)")
+    normals: str = doc("of the input: given, or estimated from its points (data=surface)")
+    clouds: int = doc("of an epoch, each drawn anew (data=surface)")
+    size: int = doc("points of a crop of a cloud (data=surface)")
+    views: int = doc("crops of a cloud (data=surface)")
+    points: int = doc("points of a validation cloud (data=surface)")
     augmentation: Augmentation = doc("Augmentation of training samples; null: none")
 
 
@@ -55,6 +62,15 @@ class Model:
     predict_normals: bool = doc("predict normals beside points")
     local_features: bool = doc("features of each point's neighbourhood")
     global_features: bool = doc("features of the whole patch")
+    neighbours: int = doc("input points that a seed looks at (model=surface, as the following)")
+    reach: int = doc("rank of the farthest of them; beyond the 16 nearest they are thinned out")
+    width: int = doc("of the network")
+    rounds: int = doc("projections, in training")
+    queries: int = doc("seeds of a crop, in training")
+    seeds: float = doc("seeds for each point wanted")
+    candidates: float = doc("of them, after thinning out to even spacing")
+    relaxation: int = doc("steps of even spacing; 0: none")
+    reject: float = doc("share of the seeds with the highest expected error that is dropped")
 
 
 @dataclass
@@ -75,6 +91,18 @@ class Loss:
     orth: str = doc("cosine of normal_orth: absolute (released code) or signed (Eq. 5)")
     unit_normals: bool = doc("normalise predicted normals before the loss; the released code does not")
     near_ties: str = doc("of the nearest prediction: released (its rounding decides) or exact")
+    w_repulsion: float = doc("weight of repulsion (PU-Net, EC-Net)")
+    h: float = doc("reach of repulsion in the unit sphere: squared for PU-Net, plain for EC-Net")
+    w_edge: float = doc("weight of the distance of edge points to the edges (EC-Net)")
+    w_edge_distance: float = doc("weight of the regressed distance to the nearest edge (EC-Net)")
+    near: float = doc("regressed distance below which a point belongs to an edge (EC-Net)")
+    reach: float = doc("distances to edges are truncated there (EC-Net)")
+    w_cd: float = doc("weight of the Chamfer distance (PUGeo-Net)")
+    w_coarse: float = doc("weight of the coarse normals (PUGeo-Net)")
+    w_normal: float = doc("weight of the refined normals (PUGeo-Net)")
+    w_drift: float = doc("weight of the way from the surface point closest to the seed (loss=surface)")
+    w_normal: float = doc("weight of predicted against true normals (loss=surface)")
+    w_error: float = doc("weight of predicted against true distance (loss=surface)")
 
 
 @dataclass

@@ -1,0 +1,162 @@
+"""Losses of the rival networks, each from its paper, on the same searches as the compound loss.
+
+Clouds are `prediction` (B, m, 3 or 6), `target` (B, n, 6). Terms are unweighted scalars, means over points and batch.
+"""
+
+from collections.abc import Mapping
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from pnu.losses.compound import chamfer, emd, search
+from pnu.ops.grouping import gather
+from pnu.ops.nearest import knn, nearest
+
+
+def total(terms: dict[str, Tensor], weights: Mapping[str, float]) -> dict[str, Tensor]:
+    """The terms and "loss", their weighted sum."""
+    return {**terms, "loss": torch.stack([weights[name] * value for name, value in terms.items()]).sum()}
+
+
+class RepulsionLoss(nn.Module):
+    """PU-Net (section 3.4): reconstruction + w_repulsion * repulsion.
+
+    Repulsion is the mean over points and their k neighbours at distance r of eta(r) w(r), eta(r) = -r and
+    w(r) = exp(-r^2 / h), so it is negative and grows in magnitude where close neighbours move apart.
+
+    Args:
+        point_term: "chamfer" or "emd", the paper's reconstruction loss (earth mover's distance, slower).
+        w_repulsion: the paper's alpha.
+        h: squared reach of the repulsion, in squared units of the patch.
+        k: neighbours that repel a point.
+    """
+
+    def __init__(self, point_term: Literal["chamfer", "emd"] = "chamfer", w_repulsion: float = 0.01, h: float = 5e-4,
+                 k: int = 5) -> None:  # fmt: skip
+        super().__init__()
+        if point_term not in ("chamfer", "emd"):
+            raise ValueError(f"loss.point_term: expected chamfer or emd, got {point_term!r}")
+        self.point_term, self.h, self.k = point_term, h, k
+        self.weights = {"cd": 1.0, "emd": 1.0, "repulsion": w_repulsion}
+
+    def forward(
+        self, prediction: Tensor, target: Tensor, extra: Mapping[str, Tensor] | None = None
+    ) -> dict[str, Tensor]:
+        matches = search(prediction, target, self.k)
+        points, terms = prediction[..., :3], {}
+        if self.point_term == "chamfer":
+            terms["cd"] = chamfer(prediction, target, matches)
+        else:
+            terms["emd"] = emd(prediction, target)
+        dist_sq = (points[:, :, None] - gather(points, matches.neighbors)).square().sum(-1)
+        terms["repulsion"] = -(dist_sq.clamp_min(1e-12).sqrt() * torch.exp(-dist_sq / self.h)).mean()
+        return total(terms, self.weights)
+
+
+class EdgeAwareLoss(nn.Module):
+    """EC-Net (section 3.3): distance to the surface, repulsion, distance of edge points to the edges, and regression
+    of the distance to the nearest edge.
+
+    surface: squared distance of new points to the true surface; the dense target stands for the mesh: distance to the
+    tangent plane of the nearest target point, plus what lies beyond the target's spacing within that plane.
+    repulsion: mean over k neighbours at distance r of max(0, h^2 - r^2).
+    edge: mean squared true distance to the nearest edge over the points whose regressed distance is below `near`.
+    edge_distance: mean squared difference of regressed and true distance, both truncated to [0, reach].
+
+    Reads from `extra`: "edge_distance" (B, m), which the network regresses, and "edges" (B, e, 3), points on the
+    sharp edges of the target, rows of NaN where there are fewer than e. Distances and weights are in the units of the
+    patch's unit sphere; the defaults of the weights are ours.
+    """
+
+    def __init__(
+        self,
+        w_repulsion: float = 1.0,
+        w_edge: float = 0.1,
+        w_edge_distance: float = 0.01,
+        h: float = 0.03,
+        k: int = 4,
+        near: float = 0.15,
+        reach: float = 0.5,
+    ) -> None:
+        super().__init__()
+        self.h, self.k, self.near, self.reach = h, k, near, reach
+        self.weights = {
+            "surface": 1.0,
+            "repulsion": w_repulsion,
+            "edge": w_edge,
+            "edge_distance": w_edge_distance,
+        }
+
+    def forward(
+        self, prediction: Tensor, target: Tensor, extra: Mapping[str, Tensor] | None = None
+    ) -> dict[str, Tensor]:
+        if not extra or "edges" not in extra or "edge_distance" not in extra:
+            raise ValueError("loss: EdgeAwareLoss needs edges in the data and a network that regresses edge_distance")
+        matches = search(prediction, target, self.k)
+        points = prediction[..., :3]
+        dist_sq = (points[:, :, None] - gather(points, matches.neighbors)).square().sum(-1)
+        true = self.distance_to_edges(points, extra["edges"])
+        regressed = extra["edge_distance"]
+        on_edge = (regressed.detach() < self.near) & (true.detach() < self.reach)
+        terms = {
+            "surface": surface_distance_sq(points, target, matches.nearest_target).mean(),
+            "repulsion": (self.h**2 - dist_sq).relu().mean(),
+            "edge": (true.square() * on_edge).sum() / on_edge.sum().clamp_min(1),
+            "edge_distance": (regressed.clamp(0, self.reach) - true.detach().clamp(0, self.reach)).square().mean(),
+        }
+        return total(terms, self.weights)
+
+    def distance_to_edges(self, points: Tensor, edges: Tensor) -> Tensor:
+        """(B, m) distance to the nearest of the edge points; far beyond `reach` in a patch without edges."""
+        edges = edges.nan_to_num(nan=10.0)
+        closest = gather(edges, nearest(points, edges).idx)
+        return (points - closest).square().sum(-1).clamp_min(1e-12).sqrt()
+
+
+def surface_distance_sq(points: Tensor, target: Tensor, nearest_target: Tensor) -> Tensor:
+    """(B, m) squared distance of points to the surface that the dense target (B, n, 6) samples."""
+    near = gather(target, nearest_target)
+    offset = points - near[..., :3]
+    height = (offset * near[..., 3:6]).sum(-1)
+    aside = (offset - height[..., None] * near[..., 3:6]).square().sum(-1)
+    spacing = target_spacing(target)[:, None]
+    return height.square() + (aside.clamp_min(1e-12).sqrt() - spacing).relu().square()
+
+
+def target_spacing(target: Tensor) -> Tensor:
+    """(B,) median distance of target points to their nearest neighbour."""
+    points = target[..., :3]
+    return knn(points, points, 2).dist_sq[..., 1].sqrt().median(1).values
+
+
+class ParameterizationLoss(nn.Module):
+    """PUGeo-Net (section 4.5): w_cd CD + w_coarse coarse normals + w_normal refined normals; 100, 1, 1 in the paper.
+
+    Normals count without their sign, min(|a - b|^2, |a + b|^2): coarse ones of the input points against the nearest
+    target's, refined ones of each prediction against its nearest target's. Reads "coarse_normal" (B, n', 3) and
+    "input" (B, n', 3+) from `extra`.
+    """
+
+    def __init__(self, w_cd: float = 100.0, w_coarse: float = 1.0, w_normal: float = 1.0) -> None:
+        super().__init__()
+        self.weights = {"cd": w_cd, "coarse_normal": w_coarse, "normal": w_normal}
+
+    def forward(
+        self, prediction: Tensor, target: Tensor, extra: Mapping[str, Tensor] | None = None
+    ) -> dict[str, Tensor]:
+        if not extra or "coarse_normal" not in extra or "input" not in extra:
+            raise ValueError("loss: ParameterizationLoss needs a network that gives coarse_normal, such as model=pugeo")
+        matches = search(prediction, target, 1)
+        at_input = nearest(extra["input"][..., :3], target[..., :3]).idx
+        terms = {
+            "cd": chamfer(prediction, target, matches),
+            "coarse_normal": unsigned_sq(extra["coarse_normal"], gather(target, at_input)[..., 3:6]).mean(),
+            "normal": unsigned_sq(prediction[..., 3:6], gather(target, matches.nearest_target)[..., 3:6]).mean(),
+        }
+        return total(terms, self.weights)
+
+
+def unsigned_sq(a: Tensor, b: Tensor) -> Tensor:
+    """Squared difference of vectors (..., 3) up to the sign of one of them."""
+    return torch.minimum((a - b).square().sum(-1), (a + b).square().sum(-1))
