@@ -118,7 +118,7 @@ class _BoxTree(NamedTuple):
         return _BoxTree(lows[::-1], highs[::-1], order, low, high)
 
     def near(self, queries: Array, reach: Array) -> tuple[Index, Index] | None:
-        """Pairs (query, piece) whose box is nearer than `reach` (m,); None if too many, and the queries can be split."""
+        """Pairs (query, piece) whose box is nearer than `reach` (m,); None if too many and queries can be split."""
         query, box = np.arange(len(queries)), np.zeros(len(queries), np.int64)
         limit = reach**2
 
