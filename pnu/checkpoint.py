@@ -77,7 +77,7 @@ def read(path: str | PathLike[str]) -> dict[str, Any]:
             content = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, LookupError) as error:
         raise ValueError(
-            f"{path}: expected a checkpoint of tensors and plain types, found a file that is broken or holds other objects"
+            f"{path}: expected a checkpoint of tensors and plain types, found a broken file or one with other objects"
         ) from error
     if not isinstance(content, dict):
         raise ValueError(f"{path}: expected a checkpoint with a dict, found {type(content).__name__}")

@@ -1,0 +1,152 @@
+"""Layers chunk by chunk against the same layers one by one."""
+
+import copy
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+import torch
+import torch.distributed
+import torch.multiprocessing
+from torch import Tensor, nn
+
+from pnu.models import chunks, layers
+from pnu.models.layers import MLP
+from pnu.models.neighborhoods import Groups, distinct, single, whole
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Many chunks and two threads, on little data."""
+    threads = torch.get_num_threads()
+    monkeypatch.setattr(chunks, "CHUNK", 1000)
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(threads)
+
+
+def mlp(*widths: int, bias: bool = True) -> MLP:
+    torch.manual_seed(0)
+    network = MLP(widths, bias=bias).double()
+    for layer in network.layers:
+        nn.init.normal_(layer.norm.weight)
+        nn.init.normal_(layer.norm.bias)
+        nn.init.normal_(layer.norm.running_mean)
+    return network
+
+
+def neighbors(clouds: int, m: int, n: int, k: int) -> Tensor:
+    """Random neighbourhoods (clouds, m, k) of 1 to k distinct points, filled up with copies of the first."""
+    found = torch.rand(clouds, m, n).argsort(-1)[..., :k].sort(-1).values
+    number = torch.randint(1, k + 1, (clouds, m, 1))
+    return torch.where(torch.arange(k) < number, found, found[..., :1])
+
+
+def run(
+    network: MLP, x: Tensor, groups: Groups | None, projected: bool, gradient: Tensor | None = None
+) -> list[Tensor]:
+    """Output, gradients of the input and of all parameters but biases, and all statistics after one step."""
+    network, x = copy.deepcopy(network), x.clone().requires_grad_()
+    rows = x if groups is None or len(groups.source) == len(x) else x[groups.source]
+    output = network(rows, groups=groups, projected=projected)
+    torch.manual_seed(1)
+    output.backward(torch.randn_like(output))
+    assert x.grad is not None
+    values = [output.detach(), x.grad, *network.buffers()]
+    return values + [
+        p.grad for name, p in network.named_parameters() if "linear.bias" not in name and p.grad is not None
+    ]
+
+
+@pytest.mark.parametrize("projected", [False, True])
+@pytest.mark.parametrize("bias", [False, True])
+@pytest.mark.parametrize("grouping", ["none", "whole", "neighbours"])
+def test_training_equals_layers(monkeypatch: pytest.MonkeyPatch, grouping: str, bias: bool, projected: bool) -> None:
+    network = mlp(7, 16, 12, 20, bias=bias)
+    x = torch.randn(3 * 50, 16 if projected else 7, dtype=torch.float64)
+    groups = plainly = whole(3, 50) if grouping == "whole" else None
+    if grouping == "neighbours":
+        idx = neighbors(3, 40, 50, 8)
+        groups, plainly = distinct(idx, 50), single(idx, 50)
+        assert len(groups.source) < 0.8 * len(plainly.source)
+    found = run(network, x, groups, projected)
+    monkeypatch.setattr(layers, "streamed", lambda *_: False)
+    for a, b in zip(found, run(network, x, plainly, projected), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+
+
+def test_equal_maxima_share_the_gradient(monkeypatch: pytest.MonkeyPatch) -> None:
+    network, x = mlp(5, 8, 6), torch.randn(10, 5, dtype=torch.float64).repeat_interleave(2, 0)
+    found = run(network, x, whole(2, 10), False)
+    monkeypatch.setattr(layers, "streamed", lambda *_: False)
+    for a, b in zip(found, run(network, x, whole(2, 10), False), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(found[1][0::2], found[1][1::2])
+
+
+@pytest.mark.parametrize("projected", [False, True])
+@pytest.mark.parametrize("grouped", [False, True])
+def test_inference_equals_layers(grouped: bool, projected: bool) -> None:
+    network = mlp(7, 16, 12, 20).eval()
+    x = torch.randn(150, 16 if projected else 7, dtype=torch.float64)
+    groups = None
+    if grouped:
+        groups = distinct(neighbors(3, 40, 50, 8), 50)
+        x = x[groups.source]
+    expected = network(x, groups=groups, projected=projected).detach()
+    with torch.no_grad():
+        torch.testing.assert_close(network(x, groups=groups, projected=projected), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_gradient_in_eval_mode_reaches_the_input() -> None:
+    network, x = mlp(3, 4, 2).eval(), torch.randn(6, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(network, x)
+
+
+def test_distinct_neighbours() -> None:
+    idx = torch.tensor([[[3, 3, 3], [0, 2, 0], [1, 2, 3]]])
+    groups = distinct(idx, 4)
+    assert groups.runs == [(1, 1), (1, 2), (1, 3)]
+    assert groups.source.tolist() == [3, 0, 2, 1, 2, 3]
+    assert groups.owner.tolist() == [0, 1, 1, 2, 2, 2]
+    assert groups.multiplicity is not None
+    assert groups.multiplicity.tolist() == [3, 2, 1, 1, 1, 1]
+
+
+def _synchronised(rank: int, folder: str, x: Tensor) -> None:
+    """One of two processes, which hold an uneven part each, with synchronised batch norm."""
+    store = torch.distributed.FileStore(str(Path(folder) / "store"), 2)
+    torch.distributed.init_process_group("gloo", store=store, rank=rank, world_size=2, timeout=timedelta(seconds=60))
+    network = nn.SyncBatchNorm.convert_sync_batchnorm(mlp(7, 16, 12))
+    part = x[:100] if rank == 0 else x[100:]
+    output = network(part)
+    output.square().sum().backward()
+    gradients = [p.grad for name, p in network.named_parameters() if "linear.bias" not in name]
+    for gradient in gradients:
+        torch.distributed.all_reduce(gradient)
+    torch.save([output.detach(), *gradients, *network.buffers()], Path(folder) / f"{rank}.pt")
+    torch.distributed.destroy_process_group()
+
+
+def test_synchronised_batch_norm(tmp_path: Path) -> None:
+    """Two processes compute what one does with all rows."""
+    x = torch.randn(150, 7, dtype=torch.float64)
+    torch.multiprocessing.spawn(_synchronised, (str(tmp_path), x), nprocs=2)
+    network = mlp(7, 16, 12)
+    output = network(x)
+    output.square().sum().backward()
+    first, second = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
+    torch.testing.assert_close(torch.cat([first[0], second[0]]), output.detach())
+    gradients = [p.grad for name, p in network.named_parameters() if "linear.bias" not in name]
+    for found, expected in zip(first[1:], [*gradients, *network.buffers()], strict=True):
+        torch.testing.assert_close(found, expected)
+
+
+def test_errors_in_threads_are_raised() -> None:
+    def fail(part: list[chunks.Chunk]) -> None:
+        raise RuntimeError(f"chunk {part[0].number}")
+
+    with pytest.raises(RuntimeError, match="chunk 0"):
+        chunks.spread(fail, chunks.row_chunks(100, 100))
+    assert torch.get_num_threads() == 2
