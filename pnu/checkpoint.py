@@ -9,9 +9,9 @@ Checkpoints are read with `weights_only=True`: tensors and plain types, never co
 
 import datetime
 import json
-import pickle
 import shutil
 import uuid
+import warnings
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
@@ -37,7 +37,11 @@ def load(source: str | PathLike[str]) -> nn.Module:
     folder = Path(source)
     if not folder.is_dir():
         raise ValueError(f"run={folder}: expected a run folder, such as outputs/<date>/<time>_<name>, found no folder")
-    network = models.build(model_config(folder))
+    config = run_config(folder)
+    network = models.build(config["model"])
+    points = config["data"].get("input_points") if isinstance(config.get("data"), dict) else None
+    if isinstance(points, int):
+        network.patch_size = points  # radii are fractions of a patch: what it was trained on
     path = checkpoint_path(folder)
     state = read(path).get("state_dict")
     if not isinstance(state, Mapping):
@@ -46,8 +50,8 @@ def load(source: str | PathLike[str]) -> nn.Module:
     return network.eval()
 
 
-def model_config(folder: Path) -> dict[str, Any]:
-    """The group `model` of a run folder's config.yaml."""
+def run_config(folder: Path) -> dict[str, Any]:
+    """A run folder's config.yaml, whose group `model` is a dict."""
     path = folder / "config.yaml"
     if not path.is_file():
         raise ValueError(f"run={folder}: expected a run folder with config.yaml, found none")
@@ -57,7 +61,7 @@ def model_config(folder: Path) -> dict[str, Any]:
         raise ValueError(f"{path}: is not YAML ({' '.join(str(error).split())}); restore or remove it") from error
     if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
         raise ValueError(f"{path}: expected a group 'model' with the network's _target_ and arguments, found none")
-    return config["model"]
+    return config
 
 
 def checkpoint_path(folder: Path) -> Path:
@@ -73,9 +77,14 @@ def read(path: str | PathLike[str]) -> dict[str, Any]:
     scalar = np.float64(0).__reduce__()[0]  # what a pickled NumPy scalar calls
     numbers: list[Any] = [(scalar, "numpy.core.multiarray.scalar"), scalar, np.dtype]
     try:
-        with torch.serialization.safe_globals([*numbers, *{type(np.dtype(kind)) for kind in "fdilq"}]):
+        with (
+            warnings.catch_warnings(action="ignore", category=UserWarning),
+            torch.serialization.safe_globals([*numbers, *{type(np.dtype(kind)) for kind in "fdilq"}]),
+        ):
             content = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, LookupError) as error:
+    except OSError:
+        raise
+    except Exception as error:  # the unpickler raises anything on a broken file
         raise ValueError(
             f"{path}: expected a checkpoint of tensors and plain types, found a broken file or one with other objects"
         ) from error
