@@ -41,7 +41,7 @@ def load(source: str | PathLike[str]) -> nn.Module:
     network = models.build(config["model"])
     points = config["data"].get("input_points") if isinstance(config.get("data"), dict) else None
     if isinstance(points, int):
-        network.patch_size = points  # radii are fractions of a patch: what it was trained on
+        network.patch_size = points  # type: ignore[assignment]  # radii are fractions of a patch: what it was trained on
     path = checkpoint_path(folder)
     state = read(path).get("state_dict")
     if not isinstance(state, Mapping):
