@@ -33,7 +33,7 @@ class Evaluate:
     normals: str = doc("of the inputs. given: those of the surface or file; estimate: estimated from the points")
     search: str = doc("for closest surface points. exact; open3d: as other scripts (differs in the faces at edges)")
     output: str | None = doc("folder for metrics.json and metrics.csv; null: evaluation/ in the run, or in outputs/")
-    save: bool = doc("write the upsampled clouds too, to the folder's clouds/")
+    save: bool = doc("write the upsampled clouds too, in the frame of the comparison, to the folder's clouds/")
     patch_size: int | None = doc("points of a patch; null: what the network was made for")
     batch_size: int | None = doc("patches at once, bounds the memory; null: by the device")
     device: str = doc("auto, cpu, cuda, cuda:1 ...")

@@ -11,9 +11,9 @@ import torch
 from pnu import surfaces
 from pnu.io import CLOUD_SUFFIXES, MESH_SUFFIXES, Mesh, read_cloud, read_mesh
 from pnu.ops.mesh import open_edges
-from pnu.ops.normalize import Frame, unit_sphere_frame
+from pnu.ops.normalize import Frame
 from pnu.ops.sampling import nonuniform_points
-from pnu.ops.surface import sample_area, sample_poisson_disk
+from pnu.ops.surface import face_areas, sample_area, sample_poisson_disk
 
 KINDS = ("uniform", "random", "nonuniform", "sparse", "noise_0.5", "noise_1")
 """Kinds of input: evenly spread (Poisson-disk), random by area, denser around three places, evenly spread with a
@@ -82,11 +82,11 @@ def draw_input(truth: Truth, kind: str, n: int, rng: np.random.Generator) -> np.
 
 
 def truth_of_mesh(shape: str, mesh: Mesh, count: int, seed: int, *, warn: Warn = print) -> Truth:
-    """A mesh as truth, with `count` Poisson-disk samples, in the unit sphere of these."""
+    """A mesh as truth, with `count` Poisson-disk samples, in its unit sphere."""
     if holes := open_edges(mesh):
         warn(f"{shape}: is not watertight ({holes} open edges); taken as an open surface")
     samples = sample_poisson_disk(mesh, count, generator(seed, shape, "truth"))
-    frame, name = frame_of(samples)
+    frame, name = frame_of(samples, mesh)
     return Truth(shape, moved_mesh(mesh, frame), moved(samples, frame), name)
 
 
@@ -128,7 +128,7 @@ def read_truth(folder: Path, shape: str, count: int, seed: int, warn: Warn) -> t
     else:
         assert mesh is not None
         even = sample_poisson_disk(mesh, count, generator(seed, shape, "truth"))
-    frame, name = frame_of(even)
+    frame, name = frame_of(even, mesh)
     return Truth(shape, mesh and moved_mesh(mesh, frame), moved(even, frame), name), frame
 
 
@@ -170,11 +170,23 @@ def generator(seed: int, shape: str, what: str) -> np.random.Generator:
     return np.random.default_rng([seed, zlib.crc32(f"{shape}/{what}".encode())])
 
 
-def frame_of(samples: np.ndarray) -> tuple[Frame, str]:
-    """The truth's unit sphere: centroid and greatest distance of its samples, or as it is if that is one already."""
-    if abs(np.linalg.norm(samples[:, :3], axis=1).max() - 1) < UNIT:
-        return Frame(torch.zeros(1, 1, 3).double(), torch.ones(1, 1, 1).double()), "as given, a unit sphere"
-    return unit_sphere_frame(torch.from_numpy(samples[None].astype(np.float64))), "unit sphere of the truth"
+def frame_of(samples: np.ndarray, mesh: Mesh | None) -> tuple[Frame, str]:
+    """The truth's unit sphere: centroid and greatest distance, of the mesh if there is one, else of the samples.
+
+    A truth whose radius about the origin is 1 already stays as it is.
+    """
+    points = samples[:, :3] if mesh is None else mesh.vertices[np.unique(mesh.faces)]
+    if abs(np.linalg.norm(points, axis=1).max() - 1) < UNIT:
+        center, scale, name = np.zeros(3), 1.0, "as given, a unit sphere"
+    else:
+        center = points.mean(0) if mesh is None else centroid(mesh)
+        scale, name = float(np.linalg.norm(points - center, axis=1).max()), "unit sphere of the truth"
+    return Frame(torch.from_numpy(center)[None, None], torch.full((1, 1, 1), scale, dtype=torch.float64)), name
+
+
+def centroid(mesh: Mesh) -> np.ndarray:
+    """Of the surface: middles of the faces weighted by area."""
+    return np.average(mesh.vertices[mesh.faces].mean(1), axis=0, weights=face_areas(mesh))
 
 
 def moved(cloud: np.ndarray, frame: Frame) -> np.ndarray:
