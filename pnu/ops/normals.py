@@ -53,6 +53,15 @@ def orient_normals(points: Tensor, normals: Tensor) -> Tensor:
     return normals * _signs(cloud, normals.to(cloud.points))[:, None].to(normals)
 
 
+def refit_normals(points: Tensor, normals: Tensor) -> Tensor:
+    """Oriented normals (n, 3) of points (n, 3), fitted again to the neighbours on the same sheet; signs stay."""
+    cloud = _Cloud.of(points)
+    turned = normals.to(cloud.points)
+    for _ in range(4):
+        turned = _field(cloud, turned)
+    return _sheet_normals(cloud, turned).to(points.dtype)
+
+
 def flip_to_reference(normals: Tensor, points: Tensor, ref_points: Tensor, ref_normals: Tensor) -> Tensor:
     """Normals (B, n, 3) at points (B, n, 3), each turned to the side of the nearest reference point's normal."""
     near = nearest(points, ref_points).idx[..., None].expand(-1, -1, 3)
@@ -98,12 +107,7 @@ def _plane_normals(points: Tensor, idx: Tensor, weight: Tensor | None = None) ->
 
 
 def _refined(points: Tensor, lines: Tensor) -> Tensor:
-    cloud = _Cloud.of(points)
-    normals = lines.to(cloud.points)
-    normals = normals * _signs(cloud, normals)[:, None]
-    for _ in range(4):
-        normals = _field(cloud, normals)
-    return _sheet_normals(cloud, normals).to(points.dtype)
+    return refit_normals(points, orient_normals(points, lines))
 
 
 def _signs(cloud: _Cloud, normals: Tensor) -> Tensor:

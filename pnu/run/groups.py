@@ -99,9 +99,8 @@ class Loss:
     reach: float = doc("distances to edges are truncated there (EC-Net)")
     w_cd: float = doc("weight of the Chamfer distance (PUGeo-Net)")
     w_coarse: float = doc("weight of the coarse normals (PUGeo-Net)")
-    w_normal: float = doc("weight of the refined normals (PUGeo-Net)")
+    w_normal: float = doc("weight of the refined (PUGeo-Net) or predicted (loss=surface) normals")
     w_drift: float = doc("weight of the way from the surface point closest to the seed (loss=surface)")
-    w_normal: float = doc("weight of predicted against true normals (loss=surface)")
     w_error: float = doc("weight of predicted against true distance (loss=surface)")
 
 
@@ -191,6 +190,7 @@ class EarlyStopping:
     monitor: str = doc("validation value that shall get smaller")
     patience: int = doc("validations without a better value before it stops")
     min_delta: float = doc("smallest change that counts as better")
+    check_on_train_epoch_end: bool = doc("false: look after each validation")
 
 
 @dataclass

@@ -1,0 +1,53 @@
+"""The true surfaces that training compares with: exact closest points on many meshes at once."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pnu.io import Mesh
+
+APART = 3.0  # between meshes of the unit sphere
+
+
+class Truth:
+    """Meshes of the unit sphere, set side by side in one ray casting scene. Needs open3d; single precision."""
+
+    def __init__(self, meshes: Sequence[Mesh]) -> None:
+        self.meshes = list(meshes)
+        side = int(np.ceil(len(self.meshes) ** (1 / 3)))
+        cell = np.stack(np.unravel_index(np.arange(len(self.meshes)), (side, side, side)), 1)
+        self.places = APART * (cell - (side - 1) / 2)
+        self.scene: Any = None
+
+    def closest(self, points: Tensor, shape: Tensor) -> tuple[Tensor, Tensor]:
+        """Closest points of surfaces and their normals, (B, m, 3) each, for points (B, m, 3) of meshes `shape` (B,)."""
+        if self.scene is None:
+            self.scene = self._build()
+        import open3d
+
+        places = self.places[shape.cpu().numpy()][:, None]
+        query = (points.detach().cpu().double().numpy() + places).astype(np.float32)
+        threads = torch.get_num_threads()
+        found = self.scene.compute_closest_points(open3d.core.Tensor.from_numpy(query), nthreads=threads)
+        closest = found["points"].numpy().astype(np.float64) - places
+        normals = found["primitive_normals"].numpy()
+        return torch.from_numpy(closest).to(points), torch.from_numpy(normals).to(points)
+
+    def _build(self) -> Any:
+        try:
+            import open3d
+        except ImportError as error:
+            raise ValueError("data: training the surface model needs open3d; pip install open3d") from error
+        scene = open3d.t.geometry.RaycastingScene()
+        for mesh, place in zip(self.meshes, self.places, strict=True):
+            scene.add_triangles(
+                open3d.core.Tensor.from_numpy((mesh.vertices + place).astype(np.float32)),
+                open3d.core.Tensor.from_numpy(mesh.faces.astype(np.uint32)),
+            )
+        return scene
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "scene": None}  # a scene cannot be pickled

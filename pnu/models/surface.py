@@ -1,0 +1,181 @@
+"""Learned surface projection: seeds around the input points are moved onto the surface that the points sample.
+
+A seed sees its nearest input points with their normals in a local frame (`pnu.ops.frames`). An algebraic sphere gives
+a first foot and normal; a small network shared by all neighbours, with maximum and attention pooling, corrects both.
+There are no patches, hence no borders; the cost grows with the output; any ratio is possible.
+"""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import normalize
+
+from pnu.ops.frames import FEATURES, local_frames
+from pnu.ops.nearest import knn
+from pnu.ops.sampling import farthest_points_large
+from pnu.ops.spread import repel, tangent_discs
+
+DENSE = 16  # neighbours that are all looked at; farther ones are thinned out
+
+
+class Projector(nn.Module):
+    """One step onto the surface, for queries (m, 3) with rough normals, from their k nearest points and normals."""
+
+    def __init__(self, width: int = 64) -> None:
+        super().__init__()
+        self.first, self.second = nn.Linear(FEATURES, width), nn.Linear(width, width)
+        self.context = nn.Linear(2 * width, width)
+        self.third = nn.Linear(width, width)
+        self.attention = nn.Linear(width, width + 2)
+        self.head = nn.Sequential(nn.Linear(3 * width, 2 * width), nn.ReLU(), nn.Linear(2 * width, width), nn.ReLU())
+        self.out = nn.Linear(width, 7)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, offsets: Tensor, normals: Tensor, hint: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Neighbours relative to the query (m, k, 3), their normals, the query's rough normal (m, 3) ->
+
+        step (m, 3), unit normal (m, 3), logarithm of the expected error in spacings (m,), spacing (m, 1)."""
+        with torch.no_grad():
+            frame = local_frames(offsets, normals, hint)
+        y = self.second(self.first(frame.features).relu()).relu()
+        context = self.context(torch.cat([y.amax(1), (y.softmax(1) * y).sum(1)], -1))
+        y = (self.third(y) + context[:, None]).relu()
+        logits = self.attention(y)
+        share = logits.softmax(1)
+        out = self.out(self.head(torch.cat([y.amax(1), (share[..., :-2] * y).sum(1), context], -1)))
+        # beside what the network finds freely, it chooses among the neighbours' normals and their bent planes
+        bent = (share[..., -1] * frame.features[..., 7]).sum(1)
+        step = torch.cat([out[:, :2], (out[:, 2] + 0.5 * bent)[:, None]], 1)
+        normal = (share[..., -2:-1] * frame.features[..., 3:6]).sum(1) + out[:, 3:6]
+        step, normal = ((v[:, None] @ frame.axes)[:, 0] for v in (step, normal))
+        return frame.base + frame.spacing * step, normalize(normal, dim=-1), out[:, 6], frame.spacing
+
+
+class Surface(nn.Module):
+    """Upsampling by learned projection: seeds, projection, rejection, farthest points, even spacing, projection.
+
+    Args:
+        ratio: points out for each point in, where none is asked for (`upsample_cloud` takes any count).
+        neighbours: input points that a seed looks at.
+        reach: rank of the farthest of them; beyond the 16 nearest they are thinned out evenly.
+        width: of the network.
+        rounds: projections in training; at work the last one follows the even spacing.
+        seeds: seeds for each point wanted.
+        candidates: seeds for each point wanted after they were thinned out to an even spacing.
+        relaxation: steps of even spacing.
+        reject: share of the seeds with the highest expected error that is dropped.
+    """
+
+    predicts_normals = True
+    patch_size = 1024
+
+    def __init__(
+        self, ratio: int = 4, neighbours: int = 24, reach: int = 24, width: int = 64, rounds: int = 2,
+        seeds: float = 3, candidates: float = 1.5, relaxation: int = 4, reject: float = 0.0, queries: int = 64,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        if not 4 <= neighbours <= reach:
+            raise ValueError(
+                f"model.reach={reach}: expected at least model.neighbours={neighbours}, which is at least 4"
+            )
+        self.ratio, self.neighbours, self.reach, self.rounds = ratio, neighbours, reach, rounds
+        self.seeds, self.candidates, self.relaxation, self.reject = seeds, candidates, relaxation, reject
+        self.queries = queries
+        self.projector = Projector(width)
+
+    def outputs(self, patch: Tensor) -> dict[str, Tensor]:
+        """Training: a seed for each of the first `queries` points of patches (B, n, 6), projected `rounds` times.
+
+        "query" and "projected" (rounds, B, queries, 6) before and after each round, "log_error" and "spacing"
+        (rounds, B, queries); "prediction" is the last of "projected". A query has no gradient.
+        """
+        count = self.queries
+        seeds = torch.stack([tangent_discs(p[:, :3], p[:, 3:], 1)[:count, 0] for p in patch])
+        query = torch.cat([seeds, patch[:, :count, 3:]], -1)
+        found: list[tuple[Tensor, ...]] = []
+        for _ in range(self.rounds):
+            projected, log_error, spacing = self.project(query, patch)
+            found.append((query, projected, log_error, spacing))
+            query = projected.detach()
+        names = ("query", "projected", "log_error", "spacing")
+        outputs = dict(zip(names, (torch.stack(values) for values in zip(*found, strict=True)), strict=True))
+        return outputs | {"prediction": outputs["projected"][-1]}
+
+    def project(self, query: Tensor, clouds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """query (B, m, 6), clouds (B, n, 6) -> projected (B, m, 6), log error (B, m), spacing (B, m)."""
+        batch, m, _ = query.shape
+        like = self.projector.out.weight
+        idx = knn(query[..., :3], clouds[..., :3], min(self.reach, clouds.shape[1])).idx[
+            ..., self.ranks(clouds.shape[1])
+        ]
+        near = clouds[torch.arange(batch, device=idx.device)[:, None, None], idx]
+        offsets = (near[..., :3] - query[:, :, None, :3]).flatten(0, 1).to(like)
+        step, normal, log_error, spacing = self.projector(
+            offsets, near[..., 3:].flatten(0, 1).to(like), query[..., 3:].flatten(0, 1).to(like)
+        )
+        moved = query[..., :3] + step.view(batch, m, 3).to(query)
+        return (
+            torch.cat([moved, normal.view(batch, m, 3).to(query)], -1),
+            log_error.view(batch, m),
+            spacing.view(batch, m),
+        )
+
+    def ranks(self, n: int) -> list[int]:
+        """Ranks of the neighbours that are looked at, of those that a cloud of n points has."""
+        far = torch.linspace(DENSE, self.reach - 1, max(self.neighbours - DENSE, 0)).round().long().tolist()
+        return [rank for rank in [*range(min(DENSE, self.neighbours)), *far] if rank < n]
+
+    def forward(self, patch: Tensor) -> Tensor:
+        """patch (B, n, 6) -> (B, ratio n, 6)."""
+        count = self.ratio * patch.shape[1]
+        return torch.stack([self.upsample_cloud(cloud, count) for cloud in patch])
+
+    @torch.no_grad()
+    def upsample_cloud(
+        self,
+        cloud: Tensor,
+        count: int,
+        *,
+        batch_size: int | None = None,
+        generator: torch.Generator | None = None,
+        progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+    ) -> Tensor:
+        """cloud (n, 6) -> (count, 6) with unit normals. Nothing is random; batch_size: queries at once."""
+        each = max(1, round(self.seeds * count / len(cloud)))
+        discs = tangent_discs(cloud[:, :3], cloud[:, 3:], each)
+        hints = cloud[:, None, 3:].expand(-1, each, -1)
+        query = torch.cat([cloud, torch.cat([discs, hints], -1).flatten(0, 1)])
+        query = thin(query, round(self.candidates * count))
+        projected, error = self.in_batches(query, cloud, batch_size, progress, "projection")
+        kept = error.argsort()[: max(count, round((1 - self.reject) * len(error)))].sort().values
+        query = thin(projected[kept], count)
+        if self.relaxation:
+            query = torch.cat([repel(query[:, :3], query[:, 3:], steps=self.relaxation), query[:, 3:]], 1)
+        return self.in_batches(query, cloud, batch_size, progress, "refinement")[0]
+
+    def in_batches(
+        self,
+        query: Tensor,
+        cloud: Tensor,
+        batch_size: int | None,
+        progress: Callable[[str, int, int], None],
+        stage: str,
+    ) -> tuple[Tensor, Tensor]:
+        """query (m, 6) -> projected (m, 6) and logarithm of the expected error (m,)."""
+        size = batch_size or (1024 if cloud.device.type == "cpu" else 2**16)
+        parts = []
+        for start in range(0, len(query), size):
+            progress(stage, start, len(query))
+            projected, log_error, spacing = self.project(query[None, start : start + size], cloud[None])
+            parts.append((projected[0], log_error[0] + spacing[0].log()))
+        progress(stage, len(query), len(query))
+        return torch.cat([p for p, _ in parts]), torch.cat([e for _, e in parts])
+
+
+def thin(cloud: Tensor, count: int) -> Tensor:
+    """Farthest points of a cloud (n, 6): (min(n, count), 6)."""
+    if len(cloud) <= count:
+        return cloud
+    return cloud[torch.from_numpy(farthest_points_large(cloud[:, :3], count)).to(cloud.device)]

@@ -1,0 +1,58 @@
+"""Spread points over a surface that is known by points and normals: seeds between the points, even spacing."""
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pnu.ops.frames import tangent_basis
+from pnu.ops.nearest import knn
+
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+RANK = 12  # of the neighbour that a disc of seeds reaches
+
+
+def tangent_discs(points: Tensor, normals: Tensor, count: int, *, rank: int = RANK) -> Tensor:
+    """Seeds on a disc around each point in its tangent plane, as wide as the rank-th neighbour is far.
+
+    points, normals (n, 3) -> (n, count, 3). Evenly spread by area (a sunflower), turned from point to point and
+    measured from the direction of the nearest neighbour: nothing is random, and seeds turn and grow with the cloud.
+    The discs overlap, so that seeds also lie in holes between the points.
+    """
+    rank = min(rank, len(points) - 1)
+    found = knn(points[None], points[None], rank + 1)
+    radius = found.dist_sq[0, :, -1:].sqrt()
+    toward = points[found.idx[0, :, 1]] - points
+    along = toward - (toward * normals).sum(-1, keepdim=True) * normals
+    short = along.norm(dim=-1, keepdim=True) <= 1e-6 * radius
+    along = normalize(torch.where(short, tangent_basis(normals)[0], along), dim=-1)
+    across = torch.linalg.cross(normals, along)
+    seed = torch.arange(count, device=points.device, dtype=points.dtype)
+    point = torch.arange(len(points), device=points.device, dtype=points.dtype)[:, None]
+    share = (seed + (point * (1 / GOLDEN_ANGLE)).frac()) / count
+    angle = GOLDEN_ANGLE * (seed + count * point)
+    r = radius * share.sqrt()
+    return (
+        points[:, None] + (r * angle.cos())[..., None] * along[:, None] + (r * angle.sin())[..., None] * across[:, None]
+    )
+
+
+def repel(points: Tensor, normals: Tensor, *, steps: int, neighbours: int = 8) -> Tensor:
+    """Even out the spacing: points (m, 3) push neighbours apart in their tangent planes, `steps` times.
+
+    Points push each other with a force that falls to zero at about the distance that evenly spread points have, so
+    a cloud does not grow beyond its border. Points of sheets that look opposite ways ignore each other.
+    """
+    for _ in range(steps):
+        k = min(neighbours + 1, len(points))
+        found = knn(points[None], points[None], k)
+        dist, idx = found.dist_sq[0, :, 1:].sqrt(), found.idx[0, :, 1:]
+        radius = 1.25 * dist[:, :6].mean(1).median()
+        away = points[:, None] - points[idx]
+        alike = (normals[:, None] * normals[idx]).sum(-1) > -0.2
+        force = (1 - dist / radius).clamp(min=0) * alike / dist.clamp(min=1e-9 * radius)
+        push = 0.5 * radius * (force[..., None] * away).sum(1)
+        push = push - (push * normals).sum(-1, keepdim=True) * normals
+        points = points + push * (0.3 * radius / push.norm(dim=-1, keepdim=True).clamp(min=0.3 * radius))
+    return points

@@ -1,0 +1,150 @@
+"""Training data of the surface model: crops, true surfaces, order, and one training step."""
+
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+from pnu.data import shapes
+from pnu.data.crops import Crops, WholeClouds, flattened
+from pnu.data.projection import Order, ProjectionDataModule
+from pnu.data.truth import Truth
+from pnu.io import Mesh, write_mesh
+from pnu.losses.surface import SurfaceLoss
+from pnu.models.surface import Surface
+from pnu.ops.surface import closest_points, face_normals, sample_area
+
+NAMES = sorted(shapes.names())[:2] + sorted(shapes.names("cad"))[-1:]
+
+
+@pytest.fixture(scope="module")
+def meshes() -> dict[str, Mesh]:
+    return {name: shapes.make(name) for name in NAMES}
+
+
+def test_truth_agrees_with_exact_closest_points(meshes: dict[str, Mesh]) -> None:
+    truth, rng = Truth(list(meshes.values())), np.random.default_rng(0)
+    order = [list(meshes)[i] for i in (2, 0, 1)]
+    queries = np.stack([sample_area(meshes[name], 200, rng)[:, :3] for name in order])
+    queries += 0.01 * rng.standard_normal(queries.shape)
+    points, normals = truth.closest(torch.from_numpy(queries), torch.tensor([2, 0, 1]))
+    for row, name in enumerate(order):
+        exact, distance, face = closest_points(meshes[name], queries[row])
+        off = np.linalg.norm(points[row].numpy() - queries[row], axis=1) - distance
+        assert np.median(abs(off)) < 1e-6
+        assert abs(off).max() < 5e-4  # single precision, long triangles
+        same = np.linalg.norm(points[row].numpy() - exact, axis=1) < 5e-4
+        agree = (normals[row].numpy() * face_normals(meshes[name])[face]).sum(1) > 0.99
+        assert same.mean() > 0.98
+        assert agree.mean() > 0.9  # the others lie on edges, where either face may be named
+
+
+def test_truth_can_be_sent_to_another_process(meshes: dict[str, Mesh]) -> None:
+    truth = Truth(list(meshes.values()))
+    query, index = torch.full((1, 1, 3), 0.9, dtype=torch.float64), torch.tensor([1])
+    expected = truth.closest(query, index)
+    for ours, theirs in zip(expected, pickle.loads(pickle.dumps(truth)).closest(query, index), strict=True):
+        torch.testing.assert_close(ours, theirs)
+
+
+@pytest.mark.parametrize("normals", ["given", "estimated"])
+def test_crops_repeat_and_lie_near_their_surface(meshes: dict[str, Mesh], normals: str) -> None:
+    crops = Crops(meshes, 8, size=200, views=2, normals=normals, seed=3)
+    again = Crops(meshes, 8, size=200, views=2, normals=normals, seed=3)
+    truth = Truth(list(meshes.values()))
+    for index in range(8):
+        item, same, other = crops[0, index], again[0, index], crops[1, index]
+        assert item["input"].shape == (2, 200, 6)
+        assert torch.equal(item["input"], same["input"])
+        assert not torch.equal(item["input"], other["input"])
+        distance = item["input"][..., :3].norm(dim=-1)
+        assert (distance.diff(dim=1) >= -1e-6).all()
+        place = item["target"][..., :3].double() + item["center"][:, None]
+        closest, direction = truth.closest(place, item["index"])
+        torch.testing.assert_close(closest, place, atol=5e-4, rtol=0)  # single precision, long triangles
+        facing = (item["target"][..., 3:] * direction).sum(-1) * item["side"][:, None]
+        assert facing.median() > 0.999
+        # rough normals keep the side of the true ones
+        assert ((item["input"][..., 3:] * item["target"][..., 3:]).sum(-1) > 0).float().mean() > 0.97
+
+
+def test_some_crops_are_noisy_and_some_are_turned_inside_out(meshes: dict[str, Mesh]) -> None:
+    items = [Crops(meshes, 60, size=64, views=1)[0, index] for index in range(60)]
+    moved = [float((i["input"] - i["target"])[..., :3].abs().max()) for i in items]
+    assert 0 < sum(m > 1e-6 for m in moved) < 30
+    assert 0 < sum(bool((i["side"] < 0).any()) for i in items) < 40
+
+
+def test_unknown_kind_of_normals_is_refused(meshes: dict[str, Mesh]) -> None:
+    with pytest.raises(ValueError, match=r"data\.normals=guessed: expected given or estimated"):
+        Crops(meshes, 1, normals="guessed")
+
+
+def test_validation_clouds_do_not_change(meshes: dict[str, Mesh]) -> None:
+    first, second = (WholeClouds(meshes, 100, normals="estimated", seed=1) for _ in range(2))
+    assert first[1]["target"].shape == (400, 6)
+    assert torch.equal(first[1]["input"], second[1]["input"])
+
+
+def test_order_goes_on_where_it_stopped() -> None:
+    whole = list(Order(6, 2, 0, 2))
+    assert whole == [(2, i) for i in range(6)]
+    resumed = Order(6, 2, 1, 2)
+    assert list(resumed) == whole[2:]
+    resumed.set_epoch(3)
+    assert list(resumed) == [(3, i) for i in range(6)]
+
+
+def test_loss_is_zero_on_the_surface_and_grows_off_it(meshes: dict[str, Mesh]) -> None:
+    truth = Truth(list(meshes.values()))
+    batch = flattened([Crops(meshes, 4, size=80, views=2)[0, i] for i in range(4)])
+    extra = {**batch, "surface": truth}
+    loss = SurfaceLoss()
+    place, normals = loss.closest(batch["target"], extra)
+    exact = torch.cat([place, normals], -1)[None]
+    spacing = torch.full(exact.shape[:3], 0.05)
+    extra |= {"query": exact, "log_error": torch.zeros(exact.shape[:3]), "spacing": spacing}
+    good = loss(exact[-1], batch["target"], {**extra, "projected": exact})
+    off = exact.clone()
+    off[..., :3] += 0.01 * off[..., 3:]
+    bad = loss(off[-1], batch["target"], {**extra, "projected": off})
+    assert good["distance"] < 1e-3
+    assert good["normal"] < 0.05
+    assert 0.1 < bad["distance"] < 0.21  # 0.01 at spacing 0.05, less where another wall is nearer
+    flipped = torch.cat([exact[..., :3], -exact[..., 3:]], -1)
+    assert loss(flipped[-1], batch["target"], {**extra, "projected": flipped})["normal"] > 1.9
+
+
+def test_data_module_and_a_few_steps(tmp_path, meshes: dict[str, Mesh]) -> None:
+    for name, mesh in meshes.items():
+        write_mesh(tmp_path / f"{name}.ply", mesh)
+    data = ProjectionDataModule(
+        str(tmp_path), False, [NAMES[0]], "given", clouds=8, size=128, views=2, batch_size=4, points=128,
+        workers=0, seed=0,
+    )  # fmt: skip
+    data.setup()
+    assert data.train_set.names == NAMES[1:] or set(data.train_set.names) == set(NAMES[1:])
+    torch.manual_seed(0)
+    model, loss = Surface(queries=32), SurfaceLoss()
+    optimizer = torch.optim.Adam(model.parameters(), 3e-3)
+    values = []
+    for _ in range(15):
+        batch = data.on_after_batch_transfer(next(iter(data.train_dataloader())), 0)
+        outputs = model.outputs(batch["input"])
+        terms = loss(outputs["prediction"], batch["target"], {**batch, **outputs})
+        optimizer.zero_grad()
+        terms["loss"].backward()
+        optimizer.step()
+        values.append(float(terms["loss"].detach()))
+    assert values[-1] < 0.9 * values[0]  # the same batch each time
+    assert next(iter(data.val_dataloader()))["target"].shape == (1, 512, 6)
+
+
+def test_missing_validation_mesh_is_named(tmp_path, meshes: dict[str, Mesh]) -> None:
+    write_mesh(tmp_path / "a.ply", meshes[NAMES[0]])
+    data = ProjectionDataModule(
+        str(tmp_path), False, ["b"], "given", clouds=8, size=128, views=2, batch_size=4, points=128, workers=0, seed=0
+    )
+    with pytest.raises(ValueError, match=r"data\.validation: found no mesh b"):
+        data.setup()

@@ -1,0 +1,194 @@
+"""The surface model: local frames, seeds, even spacing, the projection as a whole."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from pnu.models.surface import Projector, Surface
+from pnu.ops.frames import local_frames, tangent_basis
+from pnu.ops.spread import repel, tangent_discs
+from pnu.ops.transforms import rotation_matrix
+
+
+def sphere(n: int, seed: int = 0) -> Tensor:
+    """Random points of the unit sphere with their normals, (n, 6) float64."""
+    points = torch.randn(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    points = points / points.norm(dim=1, keepdim=True)
+    return torch.cat([points, points], 1)
+
+
+def wavy(n: int, seed: int = 0) -> Tensor:
+    """Random points of a bumpy, curved patch with unit normals, (n, 6) float64."""
+    x, y = torch.rand(2, n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 2 - 1
+    z = 0.2 * torch.sin(3 * x) + 0.15 * x * y + 0.1 * y**2
+    slope = torch.stack([-0.6 * torch.cos(3 * x) - 0.15 * y, -0.15 * x - 0.2 * y, torch.ones_like(x)], 1)
+    return torch.cat([torch.stack([x, y, z], 1), slope / slope.norm(dim=1, keepdim=True)], 1)
+
+
+def trained(seed: int = 0, **options: int) -> Surface:
+    """A surface model whose last layer is not zero, as after training, in float64."""
+    torch.manual_seed(seed)
+    model = Surface(**options).double().eval()
+    torch.nn.init.normal_(model.projector.out.weight, std=0.02)
+    return model
+
+
+def moved(cloud: Tensor, turn: Tensor, factor: float, shift: Tensor) -> Tensor:
+    return torch.cat([factor * cloud[:, :3] @ turn.T + shift, cloud[:, 3:] @ turn.T], 1)
+
+
+@pytest.fixture
+def turn() -> Tensor:
+    return rotation_matrix(1, generator=torch.Generator().manual_seed(3))[0].double()
+
+
+def neighbourhoods(cloud: Tensor, query: Tensor, k: int) -> tuple[Tensor, Tensor, Tensor]:
+    near = cloud[torch.cdist(query[:, :3], cloud[:, :3]).topk(k, largest=False).indices]
+    return near[..., :3] - query[:, None, :3], near[..., 3:], query[:, 3:]
+
+
+def test_frame_finds_the_sphere() -> None:
+    cloud = sphere(400)
+    query = 1.05 * cloud[:50]
+    frame = local_frames(*neighbourhoods(cloud, torch.cat([query[:, :3], cloud[:50, 3:]], 1), 24))
+    foot = query[:, :3] + frame.base
+    torch.testing.assert_close(foot, cloud[:50, :3], atol=1e-9, rtol=0)
+    torch.testing.assert_close(frame.axes[:, 2], cloud[:50, 3:], atol=1e-9, rtol=0)
+    identity = torch.eye(3, dtype=torch.float64).expand(50, 3, 3)
+    torch.testing.assert_close(frame.axes @ frame.axes.mT, identity, atol=1e-12, rtol=0)
+    # each neighbour's plane, bent evenly, passes through the foot: the sphere is exact
+    torch.testing.assert_close(frame.features[..., 7], torch.zeros(50, 24, dtype=torch.float64), atol=1e-9, rtol=0)
+
+
+def test_features_do_not_see_place_rotation_and_size(turn: Tensor) -> None:
+    cloud = wavy(400)
+    other = moved(cloud, turn, 250.0, torch.tensor([1e3, -2e3, 5.0], dtype=torch.float64))
+    ours, theirs = (local_frames(*neighbourhoods(c, c[:60], 24)) for c in (cloud, other))
+    torch.testing.assert_close(theirs.features, ours.features, atol=1e-6, rtol=0)
+    torch.testing.assert_close(theirs.spacing, 250 * ours.spacing)
+    torch.testing.assert_close(theirs.axes, ours.axes @ turn.T, atol=1e-6, rtol=0)
+
+
+def test_tangent_basis_is_orthonormal_for_every_axis() -> None:
+    normals = torch.cat([torch.eye(3), -torch.eye(3), torch.nn.functional.normalize(torch.randn(20, 3), dim=1)])
+    frame = torch.stack([*tangent_basis(normals), normals], 1)
+    torch.testing.assert_close(frame @ frame.mT, torch.eye(3).expand(26, 3, 3), atol=1e-6, rtol=0)
+
+
+def test_discs_lie_in_tangent_planes_and_reach_the_ranked_neighbour() -> None:
+    cloud = wavy(300)
+    points, normals = cloud[:, :3], cloud[:, 3:]
+    seeds = tangent_discs(points, normals, 9, rank=5)
+    away = seeds - points[:, None]
+    torch.testing.assert_close((away * normals[:, None]).sum(-1), torch.zeros(300, 9, dtype=torch.float64))
+    reach = torch.cdist(points, points).sort(dim=1).values[:, 5]
+    share = away.norm(dim=-1) / reach[:, None]
+    assert share.max() <= 1 + 1e-9
+    assert 0.45 < share.square().mean() < 0.55  # uniform by area
+
+
+def test_seeds_fill_a_hole_between_the_points() -> None:
+    ring = torch.linspace(0, 2 * torch.pi, 25, dtype=torch.float64)[:-1]
+    points = torch.stack([ring.cos(), ring.sin(), torch.zeros_like(ring)], 1)
+    normals = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand_as(points)
+    seeds = tangent_discs(points, normals, 40, rank=20).flatten(0, 1)
+    assert seeds.norm(dim=1).min() < 0.1
+
+
+def test_repulsion_evens_out_a_sphere() -> None:
+    cloud = sphere(1500)
+    spread = repel(cloud[:, :3], cloud[:, 3:], steps=10)
+
+    def unevenness(points: Tensor) -> float:
+        near = torch.cdist(points, points).topk(2, largest=False).values[:, 1]
+        return float(near.std() / near.mean())
+
+    assert unevenness(spread) < 0.5 * unevenness(cloud[:, :3])
+    assert (spread.norm(dim=1) - 1).abs().max() < 0.05
+
+
+def test_repulsion_leaves_the_two_sides_of_a_sheet_alone() -> None:
+    grid = torch.stack(torch.meshgrid(torch.arange(8.0), torch.arange(8.0), indexing="ij"), -1).reshape(-1, 2)
+    side = torch.cat([grid, torch.zeros(64, 1)], 1)
+    points = torch.cat([side, side + torch.tensor([0.1, 0, 1e-3])])
+    up = torch.tensor([0.0, 0, 1]).expand(64, 3)
+    alone, both = repel(side, up, steps=1), repel(points, torch.cat([up, -up]), steps=1)
+    pushed = repel(points, torch.cat([up, up]), steps=1)
+    assert (both[:64] - side).norm(dim=1).max() <= (alone - side).norm(dim=1).max() + 0.2
+    assert (pushed[:64] - side).norm(dim=1).median() > 3 * (both[:64] - side).norm(dim=1).median() + 1e-3
+
+
+def test_projector_starts_at_the_sphere_fit() -> None:
+    cloud = sphere(500)
+    offsets, normals, hint = neighbourhoods(cloud, torch.cat([0.97 * cloud[:40, :3], cloud[:40, 3:]], 1), 24)
+    step, normal, _, _ = Projector().double()(offsets, normals, hint)
+    torch.testing.assert_close((0.97 * cloud[:40, :3] + step).norm(dim=1), torch.ones(40, dtype=torch.float64))
+    assert (normal * cloud[:40, 3:]).sum(1).min() > 0.99
+
+
+def test_projection_turns_and_grows_with_the_cloud(turn: Tensor) -> None:
+    model, cloud = trained(), wavy(500)
+    query = torch.cat([cloud[:100, :3] + 0.02 * torch.randn(100, 3, dtype=torch.float64), cloud[:100, 3:]], 1)
+    shift = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
+    ours = model.project(query[None], cloud[None])[0][0]
+    theirs = model.project(moved(query, turn, 3.0, shift)[None], moved(cloud, turn, 3.0, shift)[None])[0][0]
+    torch.testing.assert_close(theirs, moved(ours, turn, 3.0, shift), atol=1e-4, rtol=0)
+
+
+def test_clouds_turn_and_grow(turn: Tensor) -> None:
+    model, cloud = trained(), wavy(400)
+    ours = model.upsample_cloud(cloud, 1200)
+    theirs = model.upsample_cloud(moved(cloud, turn, 2.0, torch.ones(3, dtype=torch.float64)), 1200)
+    expected = moved(ours, turn, 2.0, torch.ones(3, dtype=torch.float64))
+    apart = torch.cdist(expected[:, :3], theirs[:, :3]).min(1).values
+    # a near-tie of the farthest points may go either way
+    assert (apart < 1e-4).double().mean() > 0.98
+
+
+@pytest.mark.parametrize("count", [400, 401, 777, 1600, 3000])
+def test_count_is_exact(count: int) -> None:
+    dense = trained().upsample_cloud(wavy(400), count)
+    assert dense.shape == (count, 6)
+    torch.testing.assert_close(dense[:, 3:].norm(dim=1), torch.ones(count, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("n", [16, 17, 40])
+def test_small_clouds(n: int) -> None:
+    dense = trained(neighbours=32, reach=48).upsample_cloud(sphere(n), 4 * n)
+    assert dense.shape == (4 * n, 6)
+    assert torch.isfinite(dense).all()
+
+
+def test_batch_size_does_not_matter() -> None:
+    model, cloud = trained(), wavy(300)
+    whole, parts = (model.upsample_cloud(cloud, 900, batch_size=size) for size in (10_000, 37))
+    torch.testing.assert_close(parts, whole, atol=1e-9, rtol=0)
+
+
+def test_untrained_model_stays_on_a_sphere() -> None:
+    dense = Surface().upsample_cloud(sphere(600), 2400)
+    assert (dense[:, :3].norm(dim=1) - 1).abs().max() < 1e-3
+    assert (dense[:, :3] * dense[:, 3:]).sum(1).min() > 0.98
+
+
+def test_outputs_carry_gradients_to_every_weight() -> None:
+    model = trained(queries=20)
+    outputs = model.outputs(torch.stack([wavy(200, seed) for seed in range(2)]))
+    assert outputs["projected"].shape == (2, 2, 20, 6)
+    assert outputs["query"].requires_grad is False
+    assert torch.equal(outputs["prediction"], outputs["projected"][-1])
+    (outputs["projected"].square().sum() + outputs["log_error"].sum()).backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in model.parameters())
+
+
+def test_far_neighbours_are_thinned_out() -> None:
+    ranks = Surface(neighbours=32, reach=48).ranks(1000)
+    assert ranks[:16] == list(range(16))
+    assert len(ranks) == len(set(ranks)) == 32
+    assert ranks[-1] == 47
+    assert Surface().ranks(10) == list(range(10))
+
+
+def test_reach_below_neighbours_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"model\.reach=20: expected at least model\.neighbours=24"):
+        Surface(neighbours=24, reach=20)
