@@ -12,6 +12,7 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from pnu.losses import compound as losses
+from pnu.losses import neighborhood
 from pnu.losses.compound import CompoundLoss, Matches, search
 from pnu.ops.grouping import gather
 from pnu.ops.transport import assign
@@ -129,6 +130,29 @@ def test_gradients(term: Callable[[Tensor, Tensor, Matches], Tensor]) -> None:
     prediction, target = clouds(2, 12, 9)
     matches = search(prediction, target, 4)
     assert torch.autograd.gradcheck(lambda p: term(p, target, matches), prediction.requires_grad_())
+
+
+@pytest.mark.parametrize("absolute", [True, False])
+def test_neighborhood_terms_at_once(monkeypatch: pytest.MonkeyPatch, absolute: bool) -> None:
+    """Values and gradients of the three terms in one pass equal those one by one, also of degenerate points."""
+    monkeypatch.setattr(neighborhood, "PIECE", 20)
+    prediction, _ = clouds(3, 50, 1)
+    prediction[0, 1, :3] = prediction[0, 0, :3]
+    prediction[1, 2, 3:] = 0
+    prediction.requires_grad_()
+    idx = search(prediction, prediction, 6).neighbors
+    near = gather(prediction, idx)
+    expected = [
+        losses.point_knn(prediction, near, "sum"),
+        losses.normal_orth(prediction, near, "sum", absolute),
+        losses.normal_knn(prediction, near, "sum"),
+    ]
+    found = neighborhood.sums(prediction, idx, absolute, losses.TINY) / 3
+    torch.testing.assert_close(found, torch.stack(expected))
+    for a, b in zip(found, expected, strict=True):
+        (of_a,) = torch.autograd.grad(a, prediction, retain_graph=True)
+        (of_b,) = torch.autograd.grad(b, prediction, retain_graph=True)
+        torch.testing.assert_close(of_a, of_b)
 
 
 def test_gradient_of_the_whole_loss() -> None:

@@ -13,11 +13,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from pnu.losses import neighborhood
 from pnu.ops.grouping import gather
 from pnu.ops.nearest import knn, nearest
 from pnu.ops.transport import assign
 
 Reduction = Literal["mean", "sum"]
+ORDER = ("cd", "emd", "point_knn", "normal", "normal_orth", "normal_knn")
 TINY = 1e-16  # squared length below which a direction counts as none
 
 
@@ -191,22 +193,33 @@ class CompoundLoss(nn.Module):
         if self.unit_normals and prediction.shape[-1] >= 6:
             prediction = torch.cat([prediction[..., :3], F.normalize(prediction[..., 3:6], dim=-1)], -1)
         matches = search(prediction, target, self.k, released_rounding=self.released_rounding)
-        around = gather(prediction, matches.neighbors)
-        close = around
-        if self.point_knn_in == "target":
-            close = gather(target, knn(prediction[..., :3], target[..., :3], self.k).idx)
         terms = {
             "cd": chamfer(prediction, target, matches, self.reduction),
-            "point_knn": point_knn(prediction, close, self.reduction),
+            **self._neighborhood(prediction, matches.neighbors),
         }
+        if self.point_knn_in == "target":
+            close = gather(target, knn(prediction[..., :3], target[..., :3], self.k).idx)
+            terms["point_knn"] = point_knn(prediction, close, self.reduction)
         if "emd" in self.weights:
             terms["emd"] = emd(prediction, target, self.reduction)
         if prediction.shape[-1] >= 6:
             terms["normal"] = normal(prediction, target, matches, self.reduction, self.normal_pairs)
-            terms["normal_orth"] = normal_orth(prediction, around, self.reduction, self.absolute)
-            terms["normal_knn"] = normal_knn(prediction, around, self.reduction)
+        terms = {name: terms[name] for name in ORDER if name in terms}
         weighted = [weight * terms[name] for name, weight in self.weights.items() if weight and name in terms]
         return {**terms, "loss": torch.stack(weighted).sum() if weighted else 0 * terms["cd"]}
+
+    def _neighborhood(self, prediction: Tensor, neighbors: Tensor) -> dict[str, Tensor]:
+        """point_knn, normal_orth and normal_knn."""
+        if prediction.shape[-1] == 6 and prediction.device.type == "cpu":
+            count = neighbors.numel() if self.reduction == "mean" else len(neighbors)
+            values = neighborhood.sums(prediction, neighbors, self.absolute, TINY) / count
+            return dict(zip(("point_knn", "normal_orth", "normal_knn"), values, strict=True))
+        around = gather(prediction, neighbors)
+        terms = {"point_knn": point_knn(prediction, around, self.reduction)}
+        if prediction.shape[-1] >= 6:
+            terms["normal_orth"] = normal_orth(prediction, around, self.reduction, self.absolute)
+            terms["normal_knn"] = normal_knn(prediction, around, self.reduction)
+        return terms
 
 
 def _check(name: str, value: str, *choices: str) -> None:

@@ -1,15 +1,13 @@
 """Rows in chunks that fit the cache of a core, one thread a chunk. CPU only."""
 
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
 from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from pnu.models.neighborhoods import Groups
+from pnu.ops import threads
 
 CHUNK = 2**17  # floats in the widest matrix of a chunk: 512 KiB, a handful of which fit the cache of a core
 T = TypeVar("T")
@@ -69,26 +67,8 @@ class Scratch:
 
 def spread(work: Callable[[list[Chunk]], T], chunks: list[Chunk]) -> list[T]:
     """Call `work` with consecutive parts of the chunks, one part a thread of torch; results in order."""
-    threads = torch.get_num_threads()
-    if min(threads, len(chunks)) == 1:
-        return [_without_gradient(work, chunks)]
-    parts: list[list[Chunk]] = [[] for _ in range(threads)]
+    number, rows = torch.get_num_threads(), chunks[-1].stop
+    parts: list[list[Chunk]] = [[] for _ in range(number)]
     for chunk in chunks:
-        parts[(chunk.start + chunk.stop) * threads // (2 * chunks[-1].stop)].append(chunk)
-    # one thread for each operation: waiting for each other after every one costs more than it gains
-    torch.set_num_threads(1)
-    try:
-        return list(_threads(threads, os.getpid()).map(lambda part: _without_gradient(work, part), filter(None, parts)))
-    finally:
-        torch.set_num_threads(threads)
-
-
-def _without_gradient(work: Callable[[list[Chunk]], T], part: list[Chunk]) -> T:
-    with torch.no_grad():  # the mode is each thread's own
-        return work(part)
-
-
-@lru_cache(maxsize=1)
-def _threads(number: int, process: int) -> ThreadPoolExecutor:
-    # the number of threads of an operation is each calling thread's own, too
-    return ThreadPoolExecutor(number, "pnu-chunks", initializer=torch.set_num_threads, initargs=(1,))
+        parts[(chunk.start + chunk.stop) * number // (2 * rows)].append(chunk)
+    return threads.spread(work, [part for part in parts if part])

@@ -1,0 +1,74 @@
+"""The three neighbourhood terms at once, made for the CPU: value and gradient in one pass over pieces in the cache."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from pnu.ops.threads import spread
+
+PIECE = 1024  # points whose neighbours are handled at once
+
+
+def sums(prediction: Tensor, neighbors: Tensor, absolute: bool, tiny: float) -> Tensor:
+    """Sums over points, neighbours and clouds of `compound.point_knn`, `normal_orth` and `normal_knn`: (3,).
+
+    prediction (B, m, 6), neighbors (B, m, k) int64; `tiny`: squared length below which a direction counts as none.
+    """
+    return _Sums.apply(prediction, neighbors, absolute, tiny)
+
+
+class _Sums(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, prediction: Tensor, neighbors: Tensor, absolute: bool, tiny: float) -> Tensor:
+        columns = prediction.mT.contiguous()  # (B, 6, m): long rows of one coordinate
+        # gradients of the three sums: by points; by points and by normals; by normals
+        gradients = (
+            torch.zeros(len(columns), 12, columns.shape[2], dtype=columns.dtype) if ctx.needs_input_grad[0] else None
+        )
+
+        def work(cloud: int) -> Tensor:
+            gradient = None if gradients is None else gradients[cloud]
+            return _cloud(columns[cloud], neighbors[cloud], absolute, tiny, gradient)
+
+        total = torch.stack(spread(work, range(len(columns)))).sum(0)
+        ctx.save_for_backward(gradients)
+        return total.to(prediction.dtype)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:
+        (gradients,) = ctx.saved_tensors
+        point, orth, normal = gradient.tolist()
+        by_points = point * gradients[:, :3] + orth * gradients[:, 3:6]
+        by_normals = normal * gradients[:, 6:9] + orth * gradients[:, 9:]
+        return torch.cat([by_points, by_normals], 1).mT.contiguous(), None, None, None
+
+
+def _cloud(columns: Tensor, neighbors: Tensor, absolute: bool, tiny: float, gradient: Tensor | None) -> Tensor:
+    """Sums (3,) float64 of one cloud (6, m); fills its gradient (12, m)."""
+    total = torch.zeros(3, dtype=torch.float64)
+    for start in range(0, columns.shape[1], PIECE):
+        idx = neighbors[start : start + PIECE]
+        own = columns[:, start : start + PIECE, None]
+        offsets = own - columns.index_select(1, idx.flatten()).view(6, *idx.shape)
+        squares = offsets.square().view(2, 3, *idx.shape).sum(1)  # of points and of normals
+        normals = own[3:]
+        along = (offsets[:3] * normals).sum(0)
+        length_sq, normal_sq = squares[0].clamp_min(tiny), normals.square().sum(0).clamp_min(tiny)
+        inverse = (length_sq * normal_sq).rsqrt()
+        cosine = along * inverse
+        sign = cosine.sign() if absolute else torch.ones_like(cosine)
+        signed = cosine * sign
+        total += torch.stack([squares[0].sum(), signed.sum(), squares[1].sum()])
+        if gradient is None:
+            continue
+        inverse *= sign
+        turn = torch.where(squares[0] > tiny, signed / length_sq, 0)  # a clamped length does not change
+        pairs = torch.cat([2 * offsets[:3], normals * inverse - offsets[:3] * turn, 2 * offsets[3:]]).flatten(1)
+        gradient[:9].scatter_add_(1, idx.flatten().expand(9, -1), -pairs)
+        gradient[:9, start : start + PIECE] += pairs.view(9, *idx.shape).sum(-1)
+        shrink = torch.where(normals.square().sum(0) > tiny, signed.sum(-1, keepdim=True) / normal_sq, 0)
+        gradient[9:, start : start + PIECE] = (offsets[:3] * inverse).sum(-1) - (normals * shrink)[..., 0]
+    return total
