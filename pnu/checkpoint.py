@@ -22,21 +22,29 @@ import torch
 import yaml
 from torch import Tensor, nn
 
-from pnu import models
+from pnu import models, weights
 from pnu.io import write_json
 
 PREFIX = "model."
 
 
 def load(source: str | PathLike[str]) -> nn.Module:
-    """The trained network of a run folder, on the CPU, in eval mode.
+    """The trained network of a run folder, of a file of weights, or of that shipped name, on the CPU, in eval mode.
 
     Raises:
         ValueError: no run folder, or its config or checkpoint are not those of a network of ours.
     """
+    if (file := weights.find(source)) is not None:
+        model, tensors = weights.read(file)
+        network = models.build(model)
+        fill(network, tensors, file)
+        return network.eval()
     folder = Path(source)
     if not folder.is_dir():
-        raise ValueError(f"run={folder}: expected a run folder, such as outputs/<date>/<time>_<name>, found no folder")
+        raise ValueError(
+            f"run={folder}: expected a run folder, such as outputs/<date>/<time>_<name>, or a name of shipped weights"
+            f" ({', '.join(weights.names())}), found no folder"
+        )
     config = run_config(folder)
     network = models.build(config["model"])
     points = config["data"].get("input_points") if isinstance(config.get("data"), dict) else None
