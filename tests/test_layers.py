@@ -15,6 +15,7 @@ LAYERS = [
     {"pnu.ops"},
     {"pnu.data"},
     {"pnu.models", "pnu.losses", "pnu.metrics"},
+    {"pnu.weights"},
     {"pnu.checkpoint"},
     {"pnu.inference", "pnu.surfaces", "pnu.pictures", "pnu.page"},
     {"pnu.classical"},

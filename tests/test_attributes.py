@@ -1,0 +1,51 @@
+"""Attributes at new points: exact where they must be, and never from the other side of a sheet."""
+
+import numpy as np
+
+from pnu.ops.attributes import carry
+
+RNG = np.random.default_rng(0)
+
+
+def plane(n: int, z: float = 0.0, up: float = 1.0) -> np.ndarray:
+    return np.hstack([RNG.uniform(0, 1, (n, 2)), np.full((n, 1), z), np.tile([0, 0, up], (n, 1))])
+
+
+def test_known_points_keep_their_values() -> None:
+    cloud, values = plane(50), RNG.normal(size=(50, 3))
+    np.testing.assert_allclose(carry(cloud, cloud, values), values, atol=1e-9)
+
+
+def test_constants_stay_and_slopes_are_followed() -> None:
+    sparse, dense = plane(2000), plane(300)
+    np.testing.assert_allclose(carry(dense, sparse, np.full(2000, 7.5)), 7.5)
+    inner = dense[(abs(dense[:, :2] - 0.5) < 0.4).all(1)]
+    np.testing.assert_allclose(carry(inner, sparse, sparse[:, 0]), inner[:, 0], atol=0.03)
+
+
+def test_sides_of_a_thin_sheet_do_not_mix() -> None:
+    sparse = np.vstack([plane(500, 0.01), plane(500, -0.01, -1.0)])
+    colors = np.repeat(np.array([[255, 0, 0], [0, 0, 255]], np.uint8), 500, axis=0)
+    dense = np.vstack([plane(900, 0.01), plane(900, -0.01, -1.0)])
+    np.testing.assert_array_equal(carry(dense, sparse, colors), np.repeat(colors[[0, -1]], 900, axis=0))
+
+
+def test_types_and_shapes_stay() -> None:
+    sparse, dense = plane(40), plane(25)
+    for values in (np.arange(40), np.arange(40, dtype=np.uint8), np.ones((40, 4), np.float32), np.arange(40) > 20):
+        carried = carry(dense, sparse, values)
+        assert carried.dtype == values.dtype
+        assert carried.shape == (25, *values.shape[1:])
+
+
+def test_whole_numbers_are_rounded() -> None:
+    sparse = np.array([[0.0, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 1]])
+    dense = np.array([[0.3, 0, 0, 0, 0, 1]])
+    share = (1 / 0.3**2) / (1 / 0.3**2 + 1 / 0.7**2)
+    assert carry(dense, sparse, np.array([0, 100]))[0] == round(100 * (1 - share)) == 16
+
+
+def test_point_that_faces_no_neighbour_takes_the_nearest() -> None:
+    sparse, dense = plane(10), plane(5, up=-1.0)
+    nearest = np.linalg.norm(dense[:, None, :3] - sparse[:, :3], axis=2).argmin(1)
+    np.testing.assert_array_equal(carry(dense, sparse, np.arange(10)), nearest)

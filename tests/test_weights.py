@@ -1,0 +1,80 @@
+"""Files of weights: written, read, found by name, refused."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+import pnu
+from pnu import checkpoint, weights
+from pnu.export import main
+from pnu.models.surface import Surface
+
+MODEL = {"_target_": "pnu.models.surface.Surface", "neighbours": 12, "reach": 12, "width": 16}
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder with a run."""
+    monkeypatch.chdir(tmp_path)
+    torch.manual_seed(0)
+    checkpoint.save(tmp_path / "run", Surface(neighbours=12, reach=12, width=16), MODEL, {})
+    return tmp_path
+
+
+def test_exported_weights_are_those_of_the_run(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["run=run", "output=small.safetensors"])
+    assert capsys.readouterr().out.splitlines()[1].startswith("next:   python -m pnu.upsample run=small.safetensors")
+    ours, theirs = pnu.load("run"), pnu.load("small.safetensors")
+    assert isinstance(theirs, Surface)
+    assert not theirs.training
+    assert theirs.neighbours == 12
+    for name, value in ours.state_dict().items():
+        assert torch.equal(theirs.state_dict()[name], value)
+    assert sorted(path.name for path in place.iterdir()) == ["run", "small.safetensors"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["run=run", "output=small.pt"], "output=small.pt: expected a name that ends with .safetensors"),
+        (["run=run", "output=no/a.safetensors"], "output=no/a.safetensors: the folder no does not exist"),
+        (["run=nothing", "output=a.safetensors"], "run=nothing: expected a run folder"),
+    ],
+)
+def test_bad_export(place: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], text: str) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert text in line
+
+
+def test_broken_and_foreign_files_are_refused(place: Path) -> None:
+    Path("broken.safetensors").write_bytes(b"nothing of the kind")
+    with pytest.raises(ValueError, match=r"broken\.safetensors: expected weights as safetensors"):
+        pnu.load("broken.safetensors")
+    save_file({"a": torch.zeros(1)}, "foreign.safetensors")
+    with pytest.raises(ValueError, match=r"foreign\.safetensors: expected weights written by pnu\.export"):
+        pnu.load("foreign.safetensors")
+    weights.write("other.safetensors", MODEL | {"width": 8}, Surface(12, 12, 12, 16).state_dict())
+    with pytest.raises(ValueError, match=r"other\.safetensors: expected the state of Surface"):
+        pnu.load("other.safetensors")
+
+
+def test_code_in_a_config_is_not_run(place: Path) -> None:
+    weights.write("evil.safetensors", {"_target_": "os.mkdir", "path": "evil"}, {})
+    with pytest.raises(ValueError, match="expected a class below pnu"):
+        pnu.load("evil.safetensors")
+    assert not Path("evil").exists()
+
+
+@pytest.mark.parametrize("name", weights.names())
+def test_shipped_weights_load_and_have_a_card(name: str) -> None:
+    path = weights.FOLDER / f"{name}.safetensors"
+    assert path.stat().st_size < 10e6
+    card = path.with_suffix(".md").read_text()
+    for word in ("Data", "Command", "Results", "Limits", "Licence"):
+        assert f"## {word}" in card
+    assert all(torch.isfinite(value).all() for value in pnu.load(name).state_dict().values())
