@@ -2,13 +2,13 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pnu.run import command, doc
+from pnu.run.progress import busy
 
 
 @dataclass
@@ -98,19 +98,6 @@ def check(cfg: Any) -> None:
     if Path(cfg.output).resolve() == Path(cfg.input).resolve():
         raise ValueError(f"output={cfg.output}: is the input; give another name")
     check_writable(cfg.output)
-
-
-@contextmanager
-def busy(text: str, quiet: bool) -> Iterator[None]:
-    """A sign of life with the seconds so far, on a terminal; the child tells no progress."""
-    from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal) as bar:
-        bar.add_task(text, total=None)
-        yield
 
 
 def warn(text: str) -> None:

@@ -55,10 +55,11 @@ def corner_normals(mesh: Mesh, smooth: bool = True) -> NDArray[np.float64]:
 
 def split_creases(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Vertices `(w, 3)`, their normals `(w, 3)` and faces `(f, 3)`: vertices on sharp edges once for each side."""
-    corner = np.column_stack([mesh.faces.ravel(), np.rint(corner_normals(mesh).reshape(-1, 3) * 100)])
+    normals = corner_normals(mesh).reshape(-1, 3)
+    corner = np.column_stack([mesh.faces.ravel(), np.rint(100 * normals)])
     _, first, index = np.unique(corner, axis=0, return_index=True, return_inverse=True)
     vertex = mesh.faces.ravel()[first]
-    return mesh.vertices[vertex], corner_normals(mesh).reshape(-1, 3)[first], index.reshape(-1, 3)
+    return mesh.vertices[vertex], normals[first], index.reshape(-1, 3)
 
 
 def open_edges(mesh: Mesh) -> int:

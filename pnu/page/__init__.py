@@ -62,7 +62,7 @@ def write_page(
         tables: of each kind of input, which tabs switch between.
         views: for the 3D viewer.
         head, foot: paragraphs of plain text.
-        figures: caption -> PNG.
+        figures: caption -> PNG or WebP.
         colormap: of errors, as in `pnu.ops.colors`.
     """
     assets = {name: files(__package__).joinpath(name).read_text("utf-8") for name in ASSETS}
@@ -77,7 +77,7 @@ def write_page(
         "views_note": html.escape(views_note),
         "tabs": "".join(tab(kind, i == 0) for i, kind in enumerate(kinds)),
         "tables": "\n".join(section(kind, tables[kind], i == 0) for i, kind in enumerate(kinds)),
-        "figures": "\n".join(figure(caption, png) for caption, png in (figures or {}).items()),
+        "figures": "\n".join(figure(caption, picture) for caption, picture in (figures or {}).items()),
         "colors": json.dumps([round(float(v), 4) for v in scale.ravel() / 255]),
         "views": json.dumps([encode(view) for view in views]).replace("<", "\\u003c"),  # nothing ends the element
         "ogl": assets["ogl.min.js"],
@@ -146,7 +146,8 @@ def shown(number: float | None, digits: int) -> str:
     return "-" if number is None or not math.isfinite(number) else f"{number:.{digits}f}"
 
 
-def figure(caption: str, png: bytes) -> str:
-    data = base64.b64encode(png).decode()
+def figure(caption: str, picture: bytes) -> str:
+    data = base64.b64encode(picture).decode()
+    kind = "webp" if picture[8:12] == b"WEBP" else "png"
     text = html.escape(caption)
-    return f'<h2>{text}</h2>\n<figure><img alt="{text}" src="data:image/png;base64,{data}"></figure>'
+    return f'<h2>{text}</h2>\n<figure><img alt="{text}" src="data:image/{kind};base64,{data}"></figure>'

@@ -53,7 +53,7 @@ class Packer:
         return place
 
     def text(self) -> str:
-        return base64.b64encode(gzip.compress(b"".join(self.parts), 9, mtime=0)).decode()
+        return base64.b64encode(gzip.compress(b"".join(self.parts), 6, mtime=0)).decode()
 
 
 def encode(view: View) -> dict[str, Any]:

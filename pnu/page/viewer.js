@@ -125,7 +125,7 @@ class Viewer {
     return view.items.map((item) => ({ name: item.name, points: geometry(item.cloud), surface: geometry(item.surface) }));
   }
 
-  show(state) { this.state = state; this.last = ""; }
+  show(state) { this.state = state; this.last = ""; this.frame(); }
 
   frame() {
     if (!this.state) return;
@@ -139,7 +139,8 @@ class Viewer {
     this.renderer.setSize(width, height);
     const { drawings, columns, mode, colors } = this.state;
     const rows = Math.ceil(drawings.length / columns);
-    this.camera.perspective({ aspect: width / columns / (height / rows) });
+    const aspect = width / columns / (height / rows);
+    this.camera.perspective({ aspect, fov: (360 / Math.PI) * Math.atan(Math.tan(Math.PI / 12) / Math.min(aspect, 1)) });
     const gl = this.gl, u = this.program.uniforms;
     gl.disable(gl.SCISSOR_TEST);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);

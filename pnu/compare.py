@@ -1,0 +1,150 @@
+"""Compare trained networks and classical methods on one page: `python -m pnu.compare methods=[FOLDER,apss]`."""
+
+import shlex
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pnu.run import command, doc
+from pnu.run.groups import Data
+from pnu.run.progress import steps
+
+if TYPE_CHECKING:
+    from pnu.evaluation import Case, Upsampler
+
+
+@dataclass
+class Compare:
+    """Evaluate several methods on the same clouds; write a page with tables, surfaces and 3D views. Trains nothing."""
+
+    methods: list[str] = doc("run folders, and apss, poisson, midpoint; NAME:FOLDER gives a run another name")
+    data: Data = doc("synthetic, or meshes with data.root=FOLDER: meshes, or prepared pairs in clouds/ and truth/")
+    part: str | None = doc("of the shapes: train, val, test, all; null: test of the procedural ones, all of a folder")
+    shapes: list[str] | None = doc("names of the shapes to take; null: all of the part")
+    kinds: list[str] = doc(
+        "of input: uniform, random, nonuniform, sparse (a quarter of the points), noise_0.5, noise_1"
+    )
+    points: int = doc("points of an input cloud")
+    truth_points: int = doc("points on the true surface to compare with")
+    ratio: float = doc("points out for each point in")
+    passes: bool = doc("also networks that were trained for another ratio: by passes and farthest points")
+    normals: str = doc("of the inputs. given: those of the surface or file; estimate: estimated from the points")
+    output: str | None = doc("folder for index.html, metrics.json, metrics.csv, figures/; null: in outputs/comparison/")
+    surfaces: list[str] | None = doc("kinds of input whose clouds are made surfaces too; null: the first; []: none")
+    shown: int = doc("shapes in the figures and 3D views, the first ones; the tables have all")
+    page_mb: float = doc("size that the page should not exceed by much, in MB: fewer points of each cloud are shown")
+    colormap: str = doc("of errors. error: red = zero to blue = high, as the paper; perceptual: dark to light")
+    up: str = doc("figures: axis that points up: x, y or z")
+    azimuth: float = doc("figures: degrees that the shape is turned about the axis up=")
+    elevation: float = doc("figures: degrees that the camera looks from above")
+    size: int = doc("figures: pixels of a panel's side")
+    batch_size: int | None = doc("patches at once, bounds the memory; null: by the device")
+    device: str = doc("auto, cpu, cuda, cuda:1 ...")
+    seed: int = doc("of all that is drawn")
+    quiet: bool = doc("print nothing but warnings and errors")
+
+
+def compare(cfg: Any) -> None:
+    check(cfg)
+    from pnu import comparison, evaluation
+    from pnu.run.folder import versions
+
+    source = evaluation.source(
+        cfg.data, cfg.kinds, part=cfg.part, only=cfg.shapes, points=cfg.points, truth_points=cfg.truth_points,
+        seed=cfg.seed, normals=cfg.normals == "given", warn=warn,
+    )  # fmt: skip
+    rebuilt_kinds = source.kinds[:1] if cfg.surfaces is None else list(cfg.surfaces)
+    if unknown := [kind for kind in rebuilt_kinds if kind not in source.kinds]:
+        raise ValueError(f"surfaces={unknown[0]}: expected some of the kinds of input, {', '.join(source.kinds)}")
+    methods = upsamplers(cfg)
+    output = evaluation.result_folder(cfg.output or Path("outputs", "comparison", source.name))
+    shown: dict[tuple[str, str], comparison.Shown] = {}
+
+    def keep(case: "Case", method: str, cloud: Any) -> None:
+        if case.truth.shape in source.shapes[: cfg.shown]:
+            one = shown.setdefault((case.truth.shape, case.kind), comparison.Shown.of(case))
+            one.clouds[method] = cloud.astype("float32")
+
+    with steps(len(source.shapes) * len(source.kinds) * (len(methods) + 1), cfg.quiet) as step:
+        options = {"ratio": cfg.ratio, "seed": cfg.seed, "keep": keep, "step": step}
+        rows = list(evaluation.evaluate(methods, source.cases, **options))
+    if not cfg.quiet:
+        evaluation.print_tables(rows, f"{', '.join(methods)} on {source.name}")
+    command_line = shlex.join(["python", "-m", "pnu.compare", *sys.argv[1:]])
+    with steps(len(shown), cfg.quiet) as step:
+        written = comparison.write_comparison(
+            output,
+            rows,
+            list(shown.values()),
+            title=f"Point cloud upsampling, {cfg.ratio:g} times: {', '.join(methods)}",
+            head=[evaluation.legend(rows), f"Made by: {command_line}"],
+            settings={key: cfg[key] for key in SETTINGS} | {"data": source.name, "versions": versions()},
+            rebuilt_kinds=rebuilt_kinds,
+            look=comparison.Look(cfg.up, cfg.azimuth, cfg.elevation, cfg.size, cfg.colormap),
+            page_mb=cfg.page_mb,
+            seed=cfg.seed,
+            step=step,
+        )
+    for text in written.notes:
+        warn(text)
+    if not cfg.quiet:
+        print(f"output: {output}/index.html ({written.size / 1e6:.1f} MB), metrics.json, metrics.csv, figures/")
+        print(f"next:   open {output}/index.html in a browser")
+
+
+SETTINGS = ("methods", "kinds", "points", "truth_points", "ratio", "normals", "seed")
+
+
+def upsamplers(cfg: Any) -> dict[str, "Upsampler"]:
+    """The methods by name. ValueError for one that is neither a run folder nor a classical method, or named twice."""
+    from pnu import checkpoint, classical, evaluation
+
+    found: dict[str, Upsampler] = {}
+    for method in cfg.methods:
+        name, _, folder = method.rpartition(":")
+        if folder in classical.METHODS:
+            model, name = classical.method(folder), name or folder
+        elif Path(folder).is_dir():
+            model, name = checkpoint.load(folder), name or Path(folder).resolve().name
+        else:
+            known = ", ".join(classical.METHODS)
+            raise ValueError(f"methods={method}: expected a run folder, or one of {known}; found neither")
+        if name in found or name in ("input", "floor", "truth"):
+            raise ValueError(f"methods={method}: the name {name} is taken; give another one, methods=[NAME:{folder}]")
+        found[name] = evaluation.network_upsampler(
+            model,
+            cfg.ratio,
+            passes=cfg.passes,
+            name=method,
+            batch_size=cfg.batch_size,
+            device=cfg.device,
+            seed=cfg.seed,
+        )
+    return found
+
+
+def check(cfg: Any) -> None:
+    """Refuse what can be refused before anything is loaded."""
+    from pnu.ops.colors import COLORMAPS
+
+    for key, known in (("normals", ("given", "estimate")), ("colormap", tuple(COLORMAPS)), ("up", ("x", "y", "z"))):
+        if cfg[key] not in known:
+            raise ValueError(f"{key}={cfg[key]}: expected {' or '.join(known)}")
+    if not cfg.methods:
+        raise ValueError("methods=[]: expected run folders or classical methods, such as methods=[apss,poisson]")
+    if not 1 <= cfg.ratio < float("inf"):
+        raise ValueError(f"ratio={cfg.ratio:g}: expected a number >= 1, the points out for each point in")
+    for key, least, most in (("shown", 1, 1000), ("page_mb", 1, 1000), ("size", 64, 2048)):
+        if not least <= cfg[key] <= most:
+            raise ValueError(f"{key}={cfg[key]:g}: expected a number from {least} to {most}")
+
+
+def warn(text: str) -> None:
+    print(f"warning: {text}", file=sys.stderr)
+
+
+main = command(compare, Compare)
+
+if __name__ == "__main__":
+    main()

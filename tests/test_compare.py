@@ -1,0 +1,200 @@
+"""The command compare on real files: tables, surfaces, figures, page."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pnu import checkpoint, comparison
+from pnu.compare import main
+from pnu.comparison.shapes import error_limit, points_for, rebuild, view
+from pnu.comparison.tables import tables
+from pnu.evaluation import Case, Truth
+from pnu.io import read_json, write_mesh
+from pnu.models.pnu import PNU
+from pnu.ops.surface import sample_poisson_disk
+from tests.test_page import CHROMIUM, browse
+from tests.test_surfaces import icosphere
+
+SMALL = ["points=300", "truth_points=1200", "ratio=2", "size=100", "quiet=true"]
+NETWORK = {"_target_": "pnu.models.pnu.PNU", "ratio": 2, "local_features": False}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two shapes, and a run of a small network, untrained, for a ratio of 2."""
+    place = tmp_path_factory.mktemp("compare")
+    (place / "meshes").mkdir()
+    ball = icosphere(3)
+    write_mesh(place / "meshes" / "ball.ply", ball)
+    write_mesh(place / "meshes" / "egg.off", ball._replace(vertices=3 * ball.vertices * [1, 1.5, 1]))
+    torch.manual_seed(0)
+    checkpoint.save(place / "runs" / "first", PNU(ratio=2, local_features=False), NETWORK, {})
+    return place
+
+
+@pytest.fixture(scope="module")
+def made(place: Path) -> Path:
+    """The comparison of the network with two classical methods."""
+    methods = f"methods=[ours:{place}/runs/first,apss,midpoint]"
+    data = ["data=meshes", f"data.root={place}/meshes", "kinds=[uniform,sparse]", "shown=1"]
+    main([methods, *data, *SMALL, f"output={place}/out"])
+    return place / "out"
+
+
+def views(page: Path) -> list[dict]:
+    found = re.search(r'id="views">(.*?)</script>', page.read_text(), re.S)
+    assert found is not None
+    return json.loads(found.group(1))
+
+
+def test_tables_show_what_was_measured(made: Path) -> None:
+    found = read_json(made / "metrics.json")
+    assert {row["method"] for row in found["rows"]} == {"ours", "apss", "midpoint", "floor", "input"}
+    assert len(found["rows"]) == 5 * 2 * 2
+    page = (made / "index.html").read_text()
+    assert page.count('<section class="kind"') == 2
+    uniform = page.split('<section class="kind"')[1]
+    mean = np.mean([row["chamfer_sq"] for row in found["rows"] if (row["method"], row["kind"]) == ("apss", "uniform")])
+    cells = re.search(r"<td>apss</td><td[^>]*>([^<]*)<", uniform)
+    assert cells is not None
+    assert cells.group(1) == f"{1e3 * mean:.4f}"
+    assert re.search(r'<tr class="reference"><td>floor</td>', uniform)
+    for shape in ("ball", "egg"):
+        assert uniform.count(f">{shape}</th>") == 2  # CD and HD of each, as Table 1
+    assert "methods=[ours:" in page
+
+
+def test_surfaces_of_the_first_kind_are_measured(made: Path) -> None:
+    found = read_json(made / "metrics.json")["surfaces"]
+    assert {(row["shape"], row["kind"]) for row in found} == {("ball", "uniform")}
+    by_method = {row["method"]: row for row in found}
+    assert {"input", "apss", "midpoint"} <= by_method.keys()
+    assert by_method["apss"]["to_truth_mean"] < 0.02
+    page = (made / "index.html").read_text()
+    assert page.count("Surfaces reconstructed from the clouds") == 1
+    picture = np.asarray(Image.open(made / "figures" / "ball_uniform.png"))
+    assert picture.shape[1] > 400
+    assert not (made / "figures" / "ball_sparse.png").exists()
+
+
+def test_views_hold_every_method_and_the_truth(made: Path) -> None:
+    uniform, sparse = views(made / "index.html")
+    assert (uniform["shape"], uniform["kind"], sparse["kind"]) == ("ball", "uniform", "sparse")
+    assert [item["name"] for item in sparse["items"]] == ["input", "ours", "apss", "midpoint", "truth"]
+    counts = {item["name"]: item["cloud"]["position"][1] // 3 for item in uniform["items"]}
+    assert counts == {"input": 300, "ours": 600, "apss": 600, "midpoint": 600, "truth": 1200}
+    assert "surface" in uniform["items"][-1]
+    assert not any("surface" in item for item in sparse["items"])
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
+def test_page_is_drawn_in_a_browser(made: Path, tmp_path: Path) -> None:
+    fragment = "form=surfaces&mode=errors&item=apss"
+    dom = browse(made / "index.html", fragment, tmp_path / "one")
+    assert int(re.search(r'data-drawn="(\d+)"', dom).group(1)) > 0  # type: ignore[union-attr]
+    assert 'data-value="apss" aria-pressed="true"' in dom
+    page = np.asarray(Image.open(browse(made / "index.html", fragment, tmp_path / "two", picture=True)).convert("RGB"))
+    colored = np.ptp(page.astype(int), axis=2) > 60
+    assert colored[len(page) // 2 :].sum() > 5000
+
+
+def test_same_seed_same_numbers(made: Path, place: Path) -> None:
+    data = ["data=meshes", f"data.root={place}/meshes", "kinds=[sparse]", "surfaces=[]", "shapes=[egg]"]
+    main(["methods=[apss]", *data, *SMALL, f"output={place}/again"])
+    names = ("chamfer_sq", "hausdorff_sq", "p2f", "normal_deg")
+    first, second = (
+        [[row[name] for name in names] for row in read_json(folder / "metrics.json")["rows"]
+         if (row["shape"], row["kind"], row["method"]) == ("egg", "sparse", "apss")]
+        for folder in (made, place / "again")
+    )  # fmt: skip
+    assert first == second
+    assert (place / "again" / "figures" / "egg_sparse.png").is_file()  # clouds only
+
+
+def case() -> Case:
+    mesh = icosphere(3)
+    samples = sample_poisson_disk(mesh, 800, np.random.default_rng(0))
+    truth = Truth("ball", mesh, samples, "as given")
+    return Case("uniform", samples[::4, :3], samples[::4, 3:], truth)
+
+
+def test_a_surface_that_fails_is_left_out_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = comparison.Shown.of(case())
+    shown.clouds["bare"] = shown.clouds["input"][:, :3]
+
+    def fail(*args: object, **kwargs: object) -> None:
+        raise ValueError("Poisson reconstruction at depth=6 was killed by SIGSEGV")
+
+    monkeypatch.setattr("pnu.surfaces.reconstruct", fail)
+    made, notes = rebuild(shown)
+    assert made == {}
+    assert notes == ["input, ball, uniform: Poisson reconstruction at depth=6 was killed by SIGSEGV"]
+
+
+def test_clouds_are_thinned_to_the_size_of_the_page() -> None:
+    shown = comparison.Shown.of(case())
+    drawings = view(shown, {}, 90).drawings
+    assert [len(drawing.cloud) for drawing in drawings if drawing.cloud is not None] == [67, 89]
+    assert points_for(40, 100, 0) == 33333
+    assert points_for(40, 100, 1_000_000) < 20000
+    with pytest.raises(ValueError, match="page_mb=1: too small for 100 clouds"):
+        points_for(1, 100, 0)
+    assert error_limit([np.linspace(0, 1, 101), np.linspace(0, 3, 101), np.linspace(0, 100, 101)]) == pytest.approx(
+        2.94
+    )
+
+
+def test_a_method_that_lacks_a_surface_has_no_mean() -> None:
+    row = {"shape": "a", "kind": "k", "points_in": 1, "points_out": 4, "chamfer_sq": 1e-3, "hausdorff_sq": 2e-3}
+    rows = [row | {"method": m, "shape": s} for s in "ab" for m in ("x", "y")]
+    errors = dict.fromkeys(
+        ("to_truth_mean", "to_truth_rms", "to_truth_max", "from_truth_mean", "from_truth_max", "normal_deg_mean"), 1e-3
+    )
+    surfaces = [errors | {"shape": s, "kind": "k", "method": m} for s, m in ("ax", "bx", "ay")]
+    means, each, surface = tables(rows, surfaces)["k"]
+    assert [row.values[:2] for row in means.rows] == [[1.0, 2.0], [1.0, 2.0]]
+    assert [(column.group, column.head) for column in each.columns] == [
+        ("CD", "a"),
+        ("CD", "b"),
+        ("HD", "a"),
+        ("HD", "b"),
+    ]
+    assert {row.name: row.values[0] for row in surface.rows} == {"x": 1.0, "y": None}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["methods=[aps]"], "methods=aps: expected a run folder, or one of apss, poisson, midpoint; found neither"),
+        (["methods=[]"], r"methods=\[\]: expected run folders or classical methods"),
+        (["methods=[apss,apss]"], r"methods=apss: the name apss is taken; give another one, methods=\[NAME:apss\]"),
+        (["methods=[truth:apss]"], "the name truth is taken"),
+        (["methods=[{place}/runs/first]", "ratio=4"], "was trained for 2; give ratio=2, or passes=true"),
+        (["methods=[{place}/meshes]"], "expected a run folder with config.yaml"),
+        (["methods=[apss]", "kinds=[even]"], "kinds=even: expected some of uniform"),
+        (["methods=[apss]", "surfaces=[sparse]", "kinds=[uniform]"], "surfaces=sparse: expected some of the kinds"),
+        (["methods=[apss]", "shapes=[cow]"], "shapes=cow: expected some of"),
+        (["methods=[apss]", "output=/proc/none/x"], "output=/proc/none/x: cannot be made a folder"),
+        (["methods=[apss]", "normals=none"], "normals=none: expected given or estimate"),
+        (["methods=[apss]", "colormap=jet"], "colormap=jet: expected error or perceptual"),
+        (["methods=[apss]", "page_mb=0"], "page_mb=0: expected a number from 1 to 1000"),
+        (["methods=[apss]", "surface=[]"], "did you mean 'surfaces'"),
+        ([], "methods=... is required"),
+    ],
+)
+def test_compare_refuses(
+    place: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(place)
+    with pytest.raises(SystemExit) as stop:
+        main([*SMALL, *(argument.format(place=place) for argument in arguments)])
+    assert stop.value.code == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert re.search(message, lines[0])
+    assert not (place / "outputs").exists()
