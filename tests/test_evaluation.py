@@ -332,7 +332,17 @@ def test_command_with_a_run(place: Path, capsys: pytest.CaptureFixture[str]) -> 
 def test_command_with_a_method_twice_is_the_same(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     results = []
     for folder in ("one", "two"):
-        main([*SMALL[:2], "shapes=[cup]", "part=all", "method=apss", f"output={folder}/deep", "quiet=true"])
+        main(
+            [
+                *SMALL[:2],
+                "shapes=[cup]",
+                "part=all",
+                "kinds=[random]",
+                "method=apss",
+                f"output={folder}/deep",
+                "quiet=true",
+            ]
+        )
         results.append(read_json(Path(folder, "deep", "metrics.json"))["rows"])
     assert capsys.readouterr().out == ""
     for one, two in zip(*results, strict=True):
