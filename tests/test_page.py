@@ -139,7 +139,7 @@ def test_page_in_a_browser(tmp_path: Path) -> None:
     dom = browse(page, "shape=second&mode=errors", tmp_path / "profile")
     assert "<title>floorbca noisy</title>" in dom
     pressed = re.findall(r'data-value="([^"]*)" aria-pressed="true"', dom)
-    assert pressed == ["second", "uniform", "points", "errors"]
+    assert pressed == ["second", "uniform", "points", "errors"]  # the second shape has no noisy view
     assert int(re.search(r'data-drawn="(\d+)"', dom).group(1)) > 0  # type: ignore[union-attr]
     assert html.unescape(dom).count("<span>truth</span>") == 1
 

@@ -214,6 +214,7 @@ function start() {
     const button = $("#items").children[Number(event.key) - 1];
     if (button && !event.ctrlKey && !event.metaKey && !event.altKey) button.click();
   });
+  pickKind = (kind) => { if (views.some((view) => view.kind === kind)) { pick.kind = kind; refresh(); } };
   // A link such as page.html#shape=duck&mode=errors opens that view.
   for (const [key, value] of new URLSearchParams(location.hash.slice(1))) {
     if (key === "item") pick.grid = false;
@@ -221,6 +222,8 @@ function start() {
   }
   refresh();
 }
+
+let pickKind = null; // shows another kind of input in the viewer
 
 // Tables: a click on a head sorts, a second one turns the order round.
 for (const table of document.querySelectorAll("table.sortable")) {
@@ -242,6 +245,7 @@ for (const tab of document.querySelectorAll("#tabs button")) {
   tab.onclick = () => {
     for (const other of document.querySelectorAll("#tabs button")) other.setAttribute("aria-pressed", String(other === tab));
     for (const section of document.querySelectorAll("section.kind")) section.hidden = section.dataset.kind !== tab.dataset.kind;
+    if (pickKind) pickKind(tab.dataset.kind);
   };
 }
 if (views.length) {

@@ -42,7 +42,10 @@ class Surface(NamedTuple):
         if self.inside_out:
             found.append("the normals look inward; the surface was turned outward")
         if self.contradicted > 0.03:
-            found.append(f"{self.contradicted:.0%} of the normals contradict the surface; have them estimated anew")
+            found.append(
+                f"{self.contradicted:.0%} of the normals contradict the surface; estimate them anew, unless the shape "
+                "has details finer than the points' spacing"
+            )
         if self.missed > 0.03:
             found.append(f"{self.missed:.0%} of the points lie far from the surface; raise depth=, look at the normals")
         if self.made_up > 0.01:
