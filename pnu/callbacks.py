@@ -88,6 +88,8 @@ class Checkpoints(pl.Callback):
         self.save_last(trainer)
 
     def save_last(self, trainer: pl.Trainer) -> None:
+        for logger in trainer.loggers:
+            logger.save()  # what is logged reaches the disk no later than the checkpoint
         trainer.save_checkpoint(self.run.last)
         self.saved_step, self.saved_at, self.due = trainer.global_step, time.monotonic(), False
 
@@ -191,8 +193,7 @@ class Pictures(pl.Callback):
     def on_validation_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if self.seen % self.every == 0:
             self.draw(trainer, module)
-        if trainer.state.fn == "fit":
-            self.seen += 1
+        self.seen += 1
 
     def on_train_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if self.drawn != trainer.global_step:

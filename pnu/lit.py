@@ -25,6 +25,7 @@ TRAINER_OPTIONS = {
     "enable_progress_bar": False,
     "enable_model_summary": False,
     "num_sanity_val_steps": 0,
+    "log_every_n_steps": 1,
     "inference_mode": False,  # its tensors would stay in the metrics, of no use to the training after them
     "use_distributed_sampler": False,
 }
@@ -87,27 +88,27 @@ class UpsamplingModule(pl.LightningModule):
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         assert self.loss is not None
         outputs = {name: value.float() for name, value in self.model.outputs(batch["input"]).items()}
+        self.check_finite({"prediction": outputs["prediction"].detach().abs().amax()}, batch)
         # searches and small differences of coordinates want float32, whatever the network computed in
         with torch.autocast(self.device.type, enabled=False):
             terms = self.loss(outputs["prediction"], batch["target"], {**batch, **outputs})
-        self.check_finite({name: value.detach() for name, value in terms.items()}, batch)
-        self.log_dict(
-            {f"train/{name}": value.detach() for name, value in terms.items()}, batch_size=len(batch["input"])
-        )
+        self.terms = {name: value.detach() for name, value in terms.items()}
+        self.check_finite(self.terms, batch)
+        self.batch = batch
         return terms["loss"]
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         gradients = [p.grad for p in self.parameters() if p.grad is not None]
         norm = torch.nn.utils.get_total_norm(gradients) if gradients else torch.zeros(())
-        self.log_dict({"train/gradient_norm": norm, "train/lr": optimizer.param_groups[0]["lr"]})
         if self.trainer.precision != "16-mixed":  # whose scaler expects infinite gradients and skips their step
-            self.check_finite({"gradient": norm}, self.last_batch)
-
-    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        self.last_batch = batch
-
-    def on_train_batch_end(self, outputs: Any, batch: Batch, batch_idx: int) -> None:
-        self.last_batch = {}
+            self.check_finite({"gradient": norm}, self.batch)
+        self.batch = {}
+        values = {f"train/{name}": float(value) for name, value in self.terms.items()}
+        values |= {"train/gradient_norm": float(norm), "train/lr": float(optimizer.param_groups[0]["lr"])}
+        self.log_dict(values, logger=False)
+        # written at once, before the checkpoint of this step: a training that is killed after it loses no step's values
+        for logger in self.loggers:
+            logger.log_metrics(values, self.global_step)
 
     def check_finite(self, values: Mapping[str, Tensor], batch: Batch) -> None:
         """Stop the training at NaN or infinity and keep the batch for inspection.

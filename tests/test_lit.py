@@ -71,7 +71,7 @@ class Record(pl.loggers.logger.DummyLogger):
 
 def trainer(tmp_path: Path, logger: Any = False, **options: Any) -> pl.Trainer:
     quieten()
-    options = {"accelerator": "cpu", "max_steps": 3, "log_every_n_steps": 1, **options}
+    options = {"accelerator": "cpu", "max_steps": 3, **options}
     return pl.Trainer(default_root_dir=tmp_path, logger=logger, **TRAINER_OPTIONS, **options)
 
 

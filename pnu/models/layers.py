@@ -76,8 +76,9 @@ class MLP(nn.Sequential):
 
 
 def streamed(x: Tensor, training: bool) -> bool:
-    """Whether layers run chunk by chunk (`stack`): on the CPU, except for gradients in eval mode."""
-    return x.device.type == "cpu" and (training or not torch.is_grad_enabled())
+    """Whether layers run chunk by chunk (`stack`): on the CPU, but for gradients in eval mode and mixed precision."""
+    plainly = torch.is_autocast_enabled("cpu") or (torch.is_grad_enabled() and not training)
+    return x.device.type == "cpu" and not plainly
 
 
 class Level(NamedTuple):

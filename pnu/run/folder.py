@@ -17,6 +17,7 @@ from typing import Any
 
 from pnu.io import atomic_path, read_json, write_json
 
+INTERRUPTED = 130  # exit code of a program that Ctrl-C ends
 PACKAGES = ("pnu", "torch", "lightning", "numpy", "scipy", "hydra-core")
 # keys that change where or how a run is told about, not what it computes
 UNHASHED = ("run", "resume", "name", "quiet", "logger")
@@ -112,10 +113,12 @@ class RunFolder:
         try:
             yield record
             record["status"] = "finished"
+        except (KeyboardInterrupt, SystemExit):  # Lightning turns the first into the second
+            record |= {"status": "failed", "error": "interrupted"}
+            print(f"stopped; go on with: python -m pnu.train resume=true run={self}", file=sys.stderr)
+            sys.exit(INTERRUPTED)
         except BaseException as error:
-            record["status"] = "failed"
-            stopped = isinstance(error, KeyboardInterrupt | SystemExit)
-            record["error"] = "interrupted" if stopped else f"{type(error).__name__}: {' '.join(str(error).split())}"
+            record |= {"status": "failed", "error": f"{type(error).__name__}: {' '.join(str(error).split())}"}
             raise
         finally:
             record["ended"] = now()

@@ -158,7 +158,6 @@ class Trainer:
     benchmark: bool = doc("let cuDNN choose the fastest kernels (GPU)")
     detect_anomaly: bool = doc("find the operation that made a NaN; slow")
     profiler: str | None = doc("simple, advanced, pytorch")
-    log_every_n_steps: int = doc("training steps between two logged values")
 
 
 @dataclass

@@ -1,0 +1,188 @@
+"""`python -m pnu.train` as people type it, in processes of its own."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from pnu.checkpoint import read
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Overrides that make a training small: 20 patches of four spheres, 256 points each."""
+    path = tmp_path_factory.mktemp("data") / "spheres.h5"
+    ball = np.random.default_rng(0).normal(size=(20, 256, 3)).astype(np.float32)
+    ball /= np.linalg.norm(ball, axis=-1, keepdims=True)
+    with h5py.File(path, "w") as file:
+        file["poisson_4096"] = np.concatenate([ball, ball], -1)
+        file["name"] = np.array([f"sphere_{i % 4}" for i in range(20)], dtype=h5py.string_dtype())
+    options = ["data=patches", f"data.path={path}", "data.input_points=64", "data.target_points=256"]
+    return [*options, "data.batch_size=2", "trainer.accelerator=cpu", "callbacks.pictures.clouds=0"]
+
+
+def start(folder: Path, *arguments: str, **options: str) -> subprocess.Popen[str]:
+    environment = os.environ | {"OMP_NUM_THREADS": "1"} | options
+    command = [sys.executable, "-m", "pnu.train", *arguments]
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, cwd=folder, env=environment, stdout=pipe, stderr=pipe, text=True)
+
+
+def train(folder: Path, *arguments: str, **options: str) -> subprocess.CompletedProcess[str]:
+    process = start(folder, *arguments, **options)
+    out, err = process.communicate(timeout=300)
+    return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+
+def loaded_by(*arguments: str) -> set[str]:
+    """Top-level modules that a command has imported when it ends."""
+    code = (
+        "import sys, atexit; atexit.register(lambda: print('MODULES', *{m.split('.')[0] for m in sys.modules}));"
+        f"from pnu.train import main; main({list(arguments)!r})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    return set(done.stdout.rpartition("MODULES")[2].split())
+
+
+HEAVY = {"torch", "lightning", "open3d", "tensorboard", "torchmetrics", "scipy", "h5py"}
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["loss.w9=1"], ["-m", "loss.w9=0,1"], ["model=foo"]])
+def test_help_and_mistakes_are_answered_before_anything_heavy(arguments: list[str]) -> None:
+    loaded = loaded_by(*arguments)
+    assert "hydra" in loaded
+    assert not loaded & HEAVY
+
+
+def test_help_tells_every_key_with_its_value(tmp_path: Path) -> None:
+    began = time.perf_counter()
+    done = train(tmp_path, "--help", "loss.w3=0.25")
+    assert time.perf_counter() - began < 3
+    assert done.returncode == 0
+    assert "loss.w3=0.25" in done.stdout
+    assert "trainer.max_epochs=500" in done.stdout
+    assert "model=" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["loss.w9=1"], "error: unknown key 'loss.w9': did you mean 'loss.w"),
+        (["-m", "loss.w9=0,1"], "error: unknown key 'loss.w9': did you mean 'loss.w"),
+        (["-m", "loss.w1=0,x"], "error: loss.w1=x: expected float ("),
+        (["-m", "model=pnu,foo"], "error: model=foo: expected one of "),
+    ],
+)
+def test_mistakes_are_one_line_and_leave_nothing(tmp_path: Path, arguments: list[str], message: str) -> None:
+    done = train(tmp_path, *arguments)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith(message)
+    assert done.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_one_line_trains(tmp_path: Path, small: list[str]) -> None:
+    done = train(tmp_path, *small, "loss.w3=0.05", "trainer.max_steps=20")
+    assert (done.returncode, done.stderr) == (0, "")
+    (run,) = tmp_path.glob("outputs/*/*_train")
+    assert (
+        f"next: python -m pnu.upsample input=cloud.ply output=dense.ply run={run.relative_to(tmp_path)}" in done.stdout
+    )
+    assert "CD x 1e3" in done.stdout
+    assert read(run / "checkpoints/last.ckpt")["global_step"] == 20
+
+
+def test_a_multirun_leaves_a_complete_folder_for_each_value(tmp_path: Path, small: list[str]) -> None:
+    done = train(tmp_path, *small, "-m", "loss.w3=0,0.05", "trainer.max_steps=5", "quiet=true")
+    assert (done.returncode, done.stderr) == (0, "")
+    runs = sorted(tmp_path.glob("outputs/sweeps/*/*_train/[01]"))
+    assert len(runs) == 2
+    for run, weight in zip(runs, (0.0, 0.05), strict=True):
+        assert f"w3: {weight}\n" in (run / "config.yaml").read_text()
+        assert json.loads((run / "run.json").read_text())["status"] == "finished"
+        assert set(json.loads((run / "metrics.json").read_text())) == {"untrained", "validation", "test"}
+        assert (run / "checkpoints/best.ckpt").exists()
+        assert list((run / "tensorboard").glob("events*"))
+    first, second = (read(run / "checkpoints/last.ckpt")["state_dict"] for run in runs)
+    assert any(not torch.equal(first[name], second[name]) for name in first)
+
+
+def test_a_failed_job_leaves_the_others_and_a_record(tmp_path: Path, small: list[str]) -> None:
+    done = train(tmp_path, *small, "-m", "model.ratio=3,4", "trainer.max_steps=1", "quiet=true")
+    assert done.returncode != 0
+    assert "Traceback" not in done.stderr
+    runs = sorted(tmp_path.glob("outputs/sweeps/*/*_train/[01]"))
+    assert [json.loads((run / "run.json").read_text())["status"] for run in runs] == ["failed", "finished"]
+    assert "model.ratio" in json.loads((runs[0] / "run.json").read_text())["error"]
+
+
+def test_killed_and_resumed_as_if_never_stopped(tmp_path: Path, small: list[str]) -> None:
+    options = [*small, "callbacks.checkpoints.every_n_steps=1", "trainer.max_epochs=12", "quiet=true"]
+    process = start(tmp_path, *options, f"run={tmp_path / 'killed'}")
+    last = tmp_path / "killed/checkpoints/last.ckpt"
+    while not last.exists() and process.poll() is None:
+        time.sleep(0.05)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL, "it ended before it could be killed"
+    assert json.loads((tmp_path / "killed/run.json").read_text())["status"] == "running"
+    stopped_at = read(last)["global_step"]
+    assert train(tmp_path, f"run={tmp_path / 'killed'}", "resume=true", "quiet=true").returncode == 0
+    assert train(tmp_path, *options, f"run={tmp_path / 'whole'}").returncode == 0
+    killed, whole = (read(tmp_path / name / "checkpoints/last.ckpt") for name in ("killed", "whole"))
+    assert 0 < stopped_at < killed["global_step"] == whole["global_step"] == 60
+    assert all(torch.equal(killed["state_dict"][name], value) for name, value in whole["state_dict"].items())
+    assert json.loads((tmp_path / "killed/run.json").read_text())["status"] == "finished"
+    assert not list((tmp_path / "killed").rglob(".*")), "a temporary file was left"
+
+
+def test_interrupted_by_hand(tmp_path: Path, small: list[str]) -> None:
+    """Ctrl-C: the record says so, and the last line how to go on."""
+    process = start(tmp_path, *small, "callbacks.checkpoints.every_n_steps=1", f"run={tmp_path / 'run'}")
+    while not (tmp_path / "run/checkpoints/last.ckpt").exists() and process.poll() is None:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    assert (
+        err.strip().splitlines()[-1] == f"stopped; go on with: python -m pnu.train resume=true run={tmp_path / 'run'}"
+    )
+    assert json.loads((tmp_path / "run/run.json").read_text())["error"] == "interrupted"
+
+
+@pytest.mark.slow
+def test_two_processes_train_one_model(tmp_path: Path, small: list[str]) -> None:
+    done = train(tmp_path, *small, "trainer.devices=2", "trainer.strategy=ddp", "trainer.max_epochs=2", "quiet=true")
+    assert done.returncode == 0, done.stderr
+    (run,) = tmp_path.glob("outputs/*/*")
+    assert json.loads((run / "run.json").read_text())["status"] == "finished"
+    assert read(run / "checkpoints/last.ckpt")["global_step"] == 4  # 10 patches in batches of 2 in two processes
+
+
+@pytest.mark.slow
+def test_works_from_an_installed_wheel(tmp_path: Path) -> None:
+    """conf/ travels inside the package: the wheel's files alone, in another folder, answer --help."""
+    build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(tmp_path), str(ROOT)]
+    subprocess.run(build, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    shutil.unpack_archive(wheel, tmp_path / "site", "zip")
+    done = train(tmp_path, "--help", PYTHONPATH=str(tmp_path / "site"))
+    assert done.returncode == 0, done.stderr
+    where = [sys.executable, "-c", "import pnu.run.config as c; print(c.config_folder())"]
+    environment = os.environ | {"PYTHONPATH": str(tmp_path / "site")}
+    found = subprocess.run(where, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout
+    assert found.strip() == str(tmp_path / "site/pnu/conf")
