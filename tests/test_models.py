@@ -154,6 +154,20 @@ def test_steps_are_repeatable() -> None:
         torch.set_num_threads(threads)
 
 
+def test_mixed_precision() -> None:
+    torch.manual_seed(0)
+    network, patch = PNU(), patches(2, 64)
+    with torch.autocast("cpu", torch.bfloat16):
+        output = network(patch)
+    output.float().square().sum().backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in network.parameters())
+    network.eval()
+    with torch.no_grad():
+        expected = network(patch)
+        with torch.autocast("cpu", torch.bfloat16):
+            assert (network(patch) - expected).norm() < 0.05 * expected.norm()
+
+
 def test_bad_input() -> None:
     with pytest.raises(ValueError, match=r"patch: expected \(B, n >= 64, 6\), got \(1, 63, 6\)"):
         PNU()(torch.zeros(1, 63, 6))
