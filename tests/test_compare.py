@@ -39,8 +39,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def made(place: Path) -> Path:
-    """The comparison of the network with two classical methods."""
-    methods = f"methods=[ours:{place}/runs/first,apss,midpoint]"
+    """The comparison of two classical methods, one under another name."""
+    methods = "methods=[apss,plain:midpoint]"
     data = ["data=meshes", f"data.root={place}/meshes", "kinds=[uniform,sparse]", "shown=1"]
     main([methods, *data, *SMALL, f"output={place}/out"])
     return place / "out"
@@ -54,8 +54,8 @@ def views(page: Path) -> list[dict]:
 
 def test_tables_show_what_was_measured(made: Path) -> None:
     found = read_json(made / "metrics.json")
-    assert {row["method"] for row in found["rows"]} == {"ours", "apss", "midpoint", "floor", "input"}
-    assert len(found["rows"]) == 5 * 2 * 2
+    assert {row["method"] for row in found["rows"]} == {"apss", "plain", "floor", "input"}
+    assert len(found["rows"]) == 4 * 2 * 2
     page = (made / "index.html").read_text()
     assert page.count('<section class="kind"') == 2
     uniform = page.split('<section class="kind"')[1]
@@ -66,14 +66,14 @@ def test_tables_show_what_was_measured(made: Path) -> None:
     assert re.search(r'<tr class="reference"><td>floor</td>', uniform)
     for shape in ("ball", "egg"):
         assert uniform.count(f">{shape}</th>") == 2  # CD and HD of each, as Table 1
-    assert "methods=[ours:" in page
+    assert "methods=[apss,plain:midpoint]" in page
 
 
 def test_surfaces_of_the_first_kind_are_measured(made: Path) -> None:
     found = read_json(made / "metrics.json")["surfaces"]
     assert {(row["shape"], row["kind"]) for row in found} == {("ball", "uniform")}
     by_method = {row["method"]: row for row in found}
-    assert {"input", "apss", "midpoint"} <= by_method.keys()
+    assert {"input", "apss", "plain"} == by_method.keys()
     assert by_method["apss"]["to_truth_mean"] < 0.02
     page = (made / "index.html").read_text()
     assert page.count("Surfaces reconstructed from the clouds") == 1
@@ -85,9 +85,9 @@ def test_surfaces_of_the_first_kind_are_measured(made: Path) -> None:
 def test_views_hold_every_method_and_the_truth(made: Path) -> None:
     uniform, sparse = views(made / "index.html")
     assert (uniform["shape"], uniform["kind"], sparse["kind"]) == ("ball", "uniform", "sparse")
-    assert [item["name"] for item in sparse["items"]] == ["input", "ours", "apss", "midpoint", "truth"]
+    assert [item["name"] for item in sparse["items"]] == ["input", "apss", "plain", "truth"]
     counts = {item["name"]: item["cloud"]["position"][1] // 3 for item in uniform["items"]}
-    assert counts == {"input": 300, "ours": 600, "apss": 600, "midpoint": 600, "truth": 1200}
+    assert counts == {"input": 300, "apss": 600, "plain": 600, "truth": 1200}
     assert "surface" in uniform["items"][-1]
     assert not any("surface" in item for item in sparse["items"])
 
@@ -114,6 +114,14 @@ def test_same_seed_same_numbers(made: Path, place: Path) -> None:
     )  # fmt: skip
     assert first == second
     assert (place / "again" / "figures" / "egg_sparse.png").is_file()  # clouds only
+
+
+def test_a_network_of_a_run_folder(place: Path) -> None:
+    data = ["data=meshes", f"data.root={place}/meshes", "kinds=[uniform]", "surfaces=[]", "shapes=[ball]"]
+    main([f"methods=[{place}/runs/first,ours:{place}/runs/first]", *data, *SMALL, f"output={place}/network"])
+    rows = {row["method"]: row for row in read_json(place / "network" / "metrics.json")["rows"]}
+    assert rows["first"]["points_out"] == 600
+    assert rows["first"]["chamfer_sq"] == rows["ours"]["chamfer_sq"] > rows["floor"]["chamfer_sq"]
 
 
 def case() -> Case:
