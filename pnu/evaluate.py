@@ -1,14 +1,13 @@
 """Measure a trained network, or a classical method, on whole clouds: `python -m pnu.evaluate run=FOLDER`."""
 
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pnu.run import command, doc
 from pnu.run.groups import Data
+from pnu.run.progress import steps
 
 NORMALS = {"given": "as given", "estimate": "estimated"}
 SETTINGS = ("ratio", "points", "truth_points", "normals", "search", "passes", "seed")
@@ -18,7 +17,9 @@ SETTINGS = ("ratio", "points", "truth_points", "normals", "search", "passes", "s
 class Evaluate:
     """Upsample whole clouds of several kinds, measure the results against the true surfaces, and write tables."""
 
-    run: str | None = doc("run folder with the network; null: the newest finished one under outputs/, or `method`")
+    run: str | None = doc(
+        "run folder, or name or file of weights; null: the newest finished run under outputs/, or `method`"
+    )
     method: str | None = doc("upsampler without training instead of a run: apss, poisson or midpoint")
     data: Data = doc("synthetic, or meshes with data.root=FOLDER: meshes, or prepared pairs in clouds/ and truth/")
     part: str | None = doc("of the shapes: train, val, test, all; null: test of the procedural ones, all of a folder")
@@ -57,7 +58,9 @@ def evaluate(cfg: Any) -> None:
         model, cfg.ratio, passes=cfg.passes, name=subject, patch_size=cfg.patch_size, batch_size=cfg.batch_size,
         device=cfg.device, seed=cfg.seed,
     )  # fmt: skip
-    default = Path("outputs", "evaluation", subject) if cfg.method else Path(subject, "evaluation")
+    is_run = not cfg.method and Path(subject).is_dir()
+    name = Path(subject).name if is_run else Path(subject).stem
+    default = Path(subject, "evaluation") if is_run else Path("outputs", "evaluation", name)
     output = evaluation.result_folder(cfg.output or default / source.name)
     clouds = evaluation.result_folder(output / "clouds") if cfg.save else None
 
@@ -65,9 +68,8 @@ def evaluate(cfg: Any) -> None:
         if clouds:
             io.write_cloud(clouds / f"{case.truth.shape}_{case.kind}.ply", cloud[:, :3], cloud[:, 3:])
 
-    with progress_bar(2 * len(source.shapes) * len(source.kinds), cfg.quiet) as step:
+    with steps(2 * len(source.shapes) * len(source.kinds), cfg.quiet) as step:
         closest = raycast.closest_points if cfg.search == "open3d" else closest_points
-        name = Path(subject).name
         rows = list(
             evaluation.evaluate(
                 {name: upsampler}, source.cases, ratio=cfg.ratio, seed=cfg.seed, closest=closest, keep=keep, step=step
@@ -78,7 +80,9 @@ def evaluate(cfg: Any) -> None:
     if not cfg.quiet:
         evaluation.print_tables(rows, f"{subject}, normals of the input {NORMALS[cfg.normals]}")
         print(f"output: {output}/metrics.json, metrics.csv{', clouds/' if cfg.save else ''}")
-        print(f"next:   python -m pnu.compare methods=[{subject},{'poisson' if cfg.method == 'apss' else 'apss'}]")
+        data = f" data=meshes data.root={cfg.data.root}" if cfg.data.get("root") else ""
+        rival = "poisson" if subject == "apss" else "apss"
+        print(f"next:   python -m pnu.compare methods=[{subject},{rival}]{data}")
 
 
 def check(cfg: Any) -> None:
@@ -94,22 +98,6 @@ def check(cfg: Any) -> None:
 
 def warn(text: str) -> None:
     print(f"warning: {text}", file=sys.stderr)
-
-
-@contextmanager
-def progress_bar(total: int, quiet: bool) -> Iterator[Callable[[str], None]]:
-    """A bar on stderr with the time left; the function it gives is told of each next step."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), disable=quiet, transient=True) as bar:
-        task = bar.add_task("", total=total)
-        done = iter(range(total + 1))
-
-        def step(text: str) -> None:
-            bar.update(task, description=text, completed=next(done, total))
-
-        yield step
 
 
 main = command(evaluate, Evaluate)

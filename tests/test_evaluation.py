@@ -307,6 +307,7 @@ def test_command_with_a_run(place: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert "random: 256 -> 512 points" in out
     assert "normals of the input estimated. CD: mean squared distances" in out
     assert "output: outputs/small/evaluation/synthetic/metrics.json" in out
+    assert out.endswith("next:   python -m pnu.compare methods=[outputs/small,apss]\n")
     found = read_json(folder / "metrics.json")
     assert (found["subject"], found["ratio"], found["normals"], found["points"]) == (
         "outputs/small",
