@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from pnu.run import build, closing, command, doc, is_main_process, open_run
+from pnu.run import build, closing, command, doc, is_main_process, job_line, objective, open_run
 from pnu.run.groups import Callbacks, Data, Logger, Loss, Model, Optimizer, Scheduler, Trainer
 
 
@@ -16,6 +16,8 @@ class Train:
     run: str | None = doc("run folder; null: outputs/<date>/<time>_<name>")
     resume: bool = doc("go on with the run in run=FOLDER, with its config, from its last checkpoint")
     quiet: bool = doc("print the run folder alone")
+    sweep: str | None = doc("name of a sweep (-m) below outputs/sweeps; null: made of the command line")
+    objective: list[str] | None = doc("validation metrics that a search (hparams_search) makes small")
     data: Data = doc("Data")
     model: Model = doc("Network")
     loss: Loss = doc("Loss")
@@ -26,9 +28,13 @@ class Train:
     logger: Logger = doc("Logger")
 
 
-def train(cfg: Any) -> dict[str, float]:
-    """Train as the config says; the test metrics of the best weights by name."""
+def train(cfg: Any) -> list[float] | None:
+    """Train as the config says; the best validation's values of what the config names as objective."""
     run, config = open_run(cfg, Train)
+    if run.skip:
+        run.unlock()
+        print(f"{run}: has finished before, skipped")
+        return objective(config, run)
     with run.recorded(config) as record:
         import lightning.pytorch as pl  # seconds: only once the config is known to be good
 
@@ -58,11 +64,10 @@ def train(cfg: Any) -> dict[str, float]:
         trainer.fit(module, data, ckpt_path=start, weights_only=True)
         if run.best.exists():
             module.load_state_dict(read(run.best)["state_dict"])
-        test = trainer.test(module, data, verbose=False)[0]
-        run.add_metrics("test", test)
+        run.add_metrics("test", trainer.test(module, data, verbose=False)[0])
     if is_main_process():
-        print(run if config["quiet"] else closing(run))
-    return dict(test)
+        print(run if config["quiet"] else job_line(run) if "job" in run.facts else closing(run))
+    return objective(config, run)
 
 
 main = command(train, Train)

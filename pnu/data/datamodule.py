@@ -33,6 +33,7 @@ class PatchDataModule(pl.LightningDataModule):
         workers: processes that load; 0 loads in the training's own.
         seed: of order, downsampling and augmentation.
         input_points, target_points, downsampling, strength, centers: see `pnu.data.dataset.Options`.
+        evaluation: downsampling of validation and test; None: the training's.
         augmentation: arguments of `pnu.data.augment.Augmentation`; None: none.
         val_share, test_share: of the shapes, kept for validation and test.
     """
@@ -47,6 +48,7 @@ class PatchDataModule(pl.LightningDataModule):
         input_points: int = 1024,
         target_points: int = 4096,
         downsampling: Downsampling = "nonuniform",
+        evaluation: Downsampling | None = None,
         strength: float = 2.0,
         centers: int = 3,
         augmentation: Mapping[str, Any] | None = None,
@@ -58,6 +60,7 @@ class PatchDataModule(pl.LightningDataModule):
             raise ValueError(f"data: expected batch_size >= 1 and workers >= 0, found {batch_size} and {workers}")
         self.path, self.batch_size, self.workers, self.seed = path, batch_size, workers, seed
         self.options = Options(input_points, target_points, downsampling, strength, centers)
+        self.evaluation = self.options._replace(downsampling=evaluation or downsampling)
         self.augmentation = from_options(augmentation)
         self.shares = {"val": val_share, "test": test_share}
         self.resumed = 0, 1  # batches done, batches of an epoch
@@ -77,6 +80,7 @@ class PatchDataModule(pl.LightningDataModule):
             return
         self.file = self.patch_file()
         check_options(self.file, self.options)
+        check_options(self.file, self.evaluation)
         contents = check(self.file)
         if contents.names is None:
             print(f"{self.file} has no shape names: validation and test are its last blocks of consecutive patches")
@@ -93,8 +97,9 @@ class PatchDataModule(pl.LightningDataModule):
         """The samples of "train", "val" or "test"."""
         assert self.rows is not None
         augmentation = self.augmentation if part == "train" else None
+        options = self.options if part == "train" else self.evaluation
         return PatchDataset(
-            self.file, self.rows[part], self.options, seed=self.seed if part == "train" else 0,
+            self.file, self.rows[part], options, seed=self.seed if part == "train" else 0,
             augmentation=augmentation, names=self.names,
         )  # fmt: skip
 

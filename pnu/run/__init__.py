@@ -37,6 +37,17 @@ from pnu.run.config import compose_config
 from pnu.run.folder import RunFolder, is_main_process
 from pnu.run.resume import open_run
 from pnu.run.schema import doc
-from pnu.run.table import closing
+from pnu.run.table import closing, job_line, objective
 
-__all__ = ["RunFolder", "build", "closing", "command", "compose_config", "doc", "is_main_process", "open_run"]
+__all__ = [
+    "RunFolder",
+    "build",
+    "closing",
+    "command",
+    "compose_config",
+    "doc",
+    "is_main_process",
+    "job_line",
+    "objective",
+    "open_run",
+]

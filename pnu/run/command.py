@@ -9,9 +9,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from pnu.run import search, sweep
 from pnu.run.config import check_keys, composer, config_folder, in_multirun, one_line, variations
 from pnu.run.help import help_text
-from pnu.run.schema import check
+from pnu.run.schema import check, fields
 
 
 def command(function: Callable[[Any], Any], schema: type, name: str | None = None) -> Callable[..., Any]:
@@ -28,13 +29,12 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
     def task(cfg: Any) -> Any:
         try:
             return function(check(cfg, schema))
-        except (ValueError, OSError) as error:
-            if full_errors():
+        except Exception as error:
+            expected = isinstance(error, ValueError | OSError)
+            if full_errors() or not (expected or in_multirun()):
                 raise
             if in_multirun():
-                from hydra.errors import CompactHydraException
-
-                raise CompactHydraException(f"error: {one_line(error)}") from None
+                raise sweep.failed(error) from None
             stop(error)
 
     def main(argv: Sequence[str] | None = None) -> None:
@@ -45,22 +45,39 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
 
         parsed = get_args_parser().parse_args(arguments)
         overrides = [o for o in parsed.overrides if not o.startswith("hydra.")]
+        goes_on = parsed.multirun and "sweep" in fields(schema)
         try:
             with composer(name, parsed.config_dir) as compose:
                 if parsed.help:
                     print(help_text(schema, program, check(compose(overrides), schema, complete=False)))
                     return
-                for one in variations(overrides, parsed.config_dir):
+                if goes_on:
+                    added = sweep.arguments(overrides, name)
+                    arguments += added
+                    parsed.overrides += added
+                    overrides += [o for o in added if not o.startswith("hydra.")]
+                swept = sweep.parameters(overrides, compose) if parsed.multirun else []
+                for one in variations([*swept, *overrides]):
                     check_keys(one, schema, compose)
-                    if not parsed.cfg:
-                        check(compose(one), schema)
+                    if parsed.cfg:
+                        continue
+                    config = check(compose(one), schema)
+                    if goes_on:
+                        sweep.check_job(config)
+                if goes_on:
+                    own = [o for o in parsed.overrides if o.startswith("hydra.")]
+                    hydra_config = compose([*next(variations(overrides)), *own], True).hydra
+                    arguments += search.arguments(hydra_config)
         except (ValueError, OSError) as error:
             if full_errors():
                 raise
             stop(error)
         start = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=name)(task)
         with replaced_argv(arguments):
-            start()
+            if not goes_on or parsed.cfg:
+                start()
+            else:
+                sweep.run(start, Path(hydra_config.sweep.dir))
 
     main.schema = schema  # type: ignore[attr-defined]
     main.__doc__ = schema.__doc__

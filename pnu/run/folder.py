@@ -20,7 +20,8 @@ from pnu.io import atomic_path, read_json, write_json
 INTERRUPTED = 130  # exit code of a program that Ctrl-C ends
 PACKAGES = ("pnu", "torch", "lightning", "numpy", "scipy", "hydra-core")
 # keys that change where or how a run is told about, not what it computes
-UNHASHED = ("run", "resume", "name", "quiet", "logger")
+UNHASHED = ("run", "resume", "name", "quiet", "logger", "sweep", "objective")
+UNHASHED_DATA = ("quiet", "workers", "cache")
 
 
 class RunFolder:
@@ -34,6 +35,9 @@ class RunFolder:
         self.metrics = self.path / "metrics.json"
         self.pictures = self.path / "pictures"
         self.record_path = self.path / "run.json"
+        self.facts: dict[str, Any] = {}  # more that run.json shall tell
+        self.skip = False  # the run has finished before, nothing is to be done
+        self.lock: int | None = None  # descriptor of a lock, closed when the run ends
 
     def __str__(self) -> str:
         return str(self.path)
@@ -52,10 +56,14 @@ class RunFolder:
             raise ValueError(
                 f"run={folder}: holds a run ({status}); resume=true goes on with it, or choose another folder"
             )
-        for name in ("checkpoints", "tensorboard", "pictures"):
-            (folder.path / name).mkdir(parents=True, exist_ok=True)
-        folder.write_config(config)
+        folder.prepare(config)
         return folder
+
+    def prepare(self, config: Mapping[str, Any]) -> None:
+        """Make what a run expects in its folder."""
+        for name in ("checkpoints", "tensorboard", "pictures"):
+            (self.path / name).mkdir(parents=True, exist_ok=True)
+        self.write_config(config)
 
     @classmethod
     def existing(cls, path: str | Path | None) -> "RunFolder":
@@ -106,6 +114,7 @@ class RunFolder:
             "seed": config.get("seed"),
             "ratio": config.get("model", {}).get("ratio"),
             "config_hash": config_hash(config),
+            **self.facts,
             "wall_s": before.get("wall_s", 0.0),
         }
         start = time.monotonic()
@@ -124,6 +133,12 @@ class RunFolder:
             record["ended"] = now()
             record["wall_s"] = round(before.get("wall_s", 0.0) + time.monotonic() - start, 3)
             write_json(self.record_path, record)
+            self.unlock()
+
+    def unlock(self) -> None:
+        if self.lock is not None:
+            os.close(self.lock)
+            self.lock = None
 
 
 def new_path(name: str) -> Path:
@@ -143,6 +158,8 @@ def new_path(name: str) -> Path:
 def config_hash(config: Mapping[str, Any]) -> str:
     """Of what determines the result; the same for two runs that compute the same."""
     content = {key: value for key, value in config.items() if key not in UNHASHED}
+    if isinstance(content.get("data"), Mapping):
+        content["data"] = {key: value for key, value in content["data"].items() if key not in UNHASHED_DATA}
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 

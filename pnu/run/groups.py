@@ -38,6 +38,7 @@ class Data:
     input_points: int = doc("points of an input patch")
     target_points: int = doc("points of a target patch; fewer than the file has take a smaller patch")
     downsampling: str = doc("of target to input: nonuniform, random, poisson (evenly), given (the file's)")
+    evaluation: str | None = doc("downsampling of validation and test; null: the training's")
     strength: float = doc("nonuniform: centres are exp(strength) times denser than the farthest points; 0: uniform")
     centers: int = doc("nonuniform: dense places of a patch")
     val_share: float = doc("share of the shapes kept for validation")

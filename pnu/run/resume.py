@@ -5,6 +5,7 @@ import shlex
 from collections.abc import Sequence
 from typing import Any
 
+from pnu.run import sweep
 from pnu.run.config import flatten, in_multirun
 from pnu.run.folder import RunFolder, is_main_process
 from pnu.run.schema import check
@@ -35,7 +36,7 @@ def open_run(cfg: Any, schema: type) -> tuple[RunFolder, dict[str, Any]]:
     """The run folder and the plain config of a training.
 
     With `resume` the config is the folder's own; the command line may change what `FREE` lists. Without, the folder is
-    new, or `run` where given; in a multirun it is the job's folder below the sweep's.
+    new, or `run` where given; in a multirun it is the job's folder below the sweep's, see `pnu.run.sweep`.
 
     Raises:
         ValueError: not a run folder, a run where a new one shall be, or an override that a run cannot take.
@@ -43,7 +44,13 @@ def open_run(cfg: Any, schema: type) -> tuple[RunFolder, dict[str, Any]]:
     from omegaconf import OmegaConf
 
     config: Any = OmegaConf.to_container(cfg, resolve=True)
-    overrides, job_folder = hydra_job()
+    if in_multirun():
+        sweep.check_job(config)
+        run = sweep.job_folder(config)
+        if not run.skip:
+            run.prepare(config)
+        return run, config
+    overrides = task_overrides()
     if config["resume"]:
         run = RunFolder.existing(config["run"])
         config = restored(run, config, overrides, schema)
@@ -55,20 +62,16 @@ def open_run(cfg: Any, schema: type) -> tuple[RunFolder, dict[str, Any]]:
         if path is None:
             raise ValueError("run=FOLDER must be given where torchrun or SLURM starts the processes: all need the same")
         return RunFolder(path), config
-    config["run"] = config["run"] or job_folder
     run = RunFolder.create(config)
     os.environ[VARIABLE] = str(run.path.absolute())
     return run, config
 
 
-def hydra_job() -> tuple[list[str], str | None]:
-    """The overrides of this job, and its folder if it is one of a multirun."""
+def task_overrides() -> list[str]:
+    """The overrides of the command line."""
     from hydra.core.hydra_config import HydraConfig
 
-    if not HydraConfig.initialized():
-        return [], None
-    hydra = HydraConfig.get()
-    return list(hydra.overrides.task), hydra.runtime.output_dir if in_multirun() else None
+    return list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
 
 
 def restored(run: RunFolder, config: dict[str, Any], overrides: Sequence[str], schema: type) -> dict[str, Any]:

@@ -1,5 +1,8 @@
 """What a training prints at its end."""
 
+from collections.abc import Mapping
+from typing import Any
+
 from pnu.io import read_json
 from pnu.run.folder import RunFolder
 
@@ -13,6 +16,28 @@ SHOWN = {
     "flipped": ("normals flipped (%)", 100.0, ".1f"),
 }
 TITLES = {"untrained": "untrained", "validation": "best validation", "test": "test"}
+
+
+def objective(config: Mapping[str, Any], run: RunFolder) -> list[float] | None:
+    """The best validation's values of the metrics that `config["objective"]` names.
+
+    Raises:
+        ValueError: there is no such metric.
+    """
+    if not config["objective"]:
+        return None
+    found = read_json(run.metrics)["validation"]
+    missing = set(config["objective"]) - set(found)
+    if missing:
+        raise ValueError(f"objective={sorted(missing)}: expected some of {', '.join(sorted(set(found) - {'step'}))}")
+    return [found[name] for name in config["objective"]]
+
+
+def job_line(run: RunFolder) -> str:
+    """The test metrics of one job of a sweep."""
+    test = read_json(run.metrics)["test"]
+    parts = [f"{title} {factor * test[name]:{form}}" for name, (title, factor, form) in SHOWN.items() if name in test]
+    return f"job {run.facts['job']} finished: {run}: {', '.join(parts)}"
 
 
 def closing(run: RunFolder) -> str:

@@ -1,0 +1,156 @@
+"""Sweeps that go on: the same command finds the same folder, and each job finds what is left of itself there.
+
+    outputs/sweeps/<sweep>/multirun.yaml                 what was swept, by Hydra
+                           <what differs>_<hash>/        a run folder for each job; the hash is that of its config
+
+A job whose folder tells that it finished is skipped; one that was interrupted goes on from its last checkpoint, or
+starts again where it has none.
+"""
+
+import hashlib
+import os
+import re
+import shutil
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pnu.io import read_json
+from pnu.run.config import one_line, parse, variations
+from pnu.run.folder import RunFolder, config_hash
+
+UNNAMED = ("sweep", "quiet")  # keys that do not make another sweep
+
+
+def sweep_name(overrides: Sequence[str], program: str) -> str:
+    """The name of the sweep that a command line describes: the same for the same line."""
+    values = {o.key_or_group: o.get_value_element_as_str() for o in parse(list(overrides))}
+    kept = sorted(f"{k}={v}" for k, v in values.items() if k not in UNNAMED and not k.startswith("hydra"))
+    given = [values[key] for key in ("ablation", "hparams_search", "scale") if key in values]
+    return "_".join([*(given or [program]), hashlib.sha256(" ".join(kept).encode()).hexdigest()[:6]])
+
+
+def arguments(overrides: Sequence[str], program: str) -> list[str]:
+    """What a sweep's command line gets added: its name, and which keys are the same in all jobs."""
+    parsed = parse(list(overrides))
+    added = []
+    if "sweep" not in {override.key_or_group for override in parsed}:
+        added.append(f"sweep={sweep_name(overrides, program)}")
+    same = {o.key_or_group for o in parsed if not o.is_sweep_override()} | {"sweep"}
+    added.append(f"hydra.job.config.override_dirname.exclude_keys=[{','.join(sorted(same))}]")
+    return added
+
+
+def check_job(config: Mapping[str, Any]) -> None:
+    """Refuse what a job of a sweep cannot be.
+
+    Raises:
+        ValueError: more than one device, a run folder, or resume.
+    """
+    for key in ("run", "resume"):
+        if config.get(key):
+            raise ValueError(
+                f"{key}={config[key]}: not in a sweep, whose jobs find their folders and go on by themselves"
+            )
+    sweep = config.get("sweep")
+    if sweep and (not re.fullmatch(r"[\w.,=+-][\w.,=+ -]*", sweep) or set(sweep) == {"."}):
+        raise ValueError(f"sweep={sweep}: expected the name of a folder below outputs/sweeps")
+    trainer = config.get("trainer") or {}
+    devices = trainer.get("devices", 1)
+    several = str(devices) not in ("1", "None") and not (isinstance(devices, Sequence) and len(devices) == 1)
+    if several or trainer.get("num_nodes", 1) != 1 or "ddp" in str(trainer.get("strategy")):
+        raise ValueError(
+            f"trainer.devices={devices}, trainer.strategy={trainer.get('strategy')}: a job of a sweep has one device;"
+            " a distributed training starts the command line again for each device, and with it the whole sweep."
+            " For several devices run several jobs at a time: hydra/launcher=joblib or submitit_slurm"
+        )
+
+
+def job_folder(config: Mapping[str, Any]) -> RunFolder:
+    """The run folder of this job of a sweep, locked until the process ends; made empty where nothing can be kept.
+
+    `folder.skip` tells that its run has finished, and there is nothing left to do.
+
+    Raises:
+        ValueError: another process runs this job.
+    """
+    from hydra.core.hydra_config import HydraConfig
+
+    hydra = HydraConfig.get()
+    sweep, digest = Path(hydra.runtime.output_dir), config_hash(config)
+    label = ",".join(part.rpartition("/")[2] for part in str(hydra.job.override_dirname).split(",") if part)
+    label = re.sub(r"[^\w.,=+-]", "-", label.replace("setting=", ""))[:100] or str(config["name"])
+    found = [run for run in runs(sweep) if read_json(run.record_path).get("config_hash") == digest]
+    folder = found[0] if found else RunFolder(sweep / f"{label}_{digest[:8]}")
+    folder.path.mkdir(parents=True, exist_ok=True)
+    folder.lock = locked(folder.path)
+    record = folder.read_record()
+    folder.skip = record.get("status") == "finished"
+    if not folder.skip and not folder.last.exists():  # nothing to go on from
+        for entry in folder.path.iterdir():
+            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+    choices = hydra.runtime.choices
+    folder.facts = {"job": hydra.job.num, "setting": choices.get("setting"), "ablation": choices.get("ablation")}
+    return folder
+
+
+def locked(path: Path) -> int:
+    """A lock on a folder that the system takes back when the process ends, however it ends."""
+    import fcntl  # not on Windows
+
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise ValueError(f"{path}: another process runs this job; wait for it") from None
+    except OSError:  # a file system without locks
+        pass
+    return descriptor
+
+
+def parameters(overrides: Sequence[str], compose: Callable[..., Any]) -> list[str]:
+    """The overrides that the config itself sweeps over, but for those that the command line sets."""
+    given = {override.key_or_group for override in parse(list(overrides))}
+    params = compose(next(variations(list(overrides))), True).hydra.sweeper.get("params") or {}
+    return [f"{key}={value}" for key, value in params.items() if key not in given]
+
+
+def failed(error: Exception) -> Exception:
+    """What a job raises for Hydra, which ends the command with it after the other jobs; told at once on stderr."""
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.errors import CompactHydraException
+
+    job = HydraConfig.get().job
+    text = one_line(error) if isinstance(error, ValueError | OSError) else f"{type(error).__name__}: {one_line(error)}"
+    print(f"job {job.num} ({job.override_dirname}) failed: {text}", file=sys.stderr, flush=True)
+    return CompactHydraException(f"error: {text}")
+
+
+def run(start: Callable[[], None], folder: Path) -> None:
+    """Start a sweep; at its end tell how its jobs ended. Exit code 1 if any failed."""
+    began = time.time() - 1
+    try:
+        start()
+    except SystemExit:
+        print(closing(folder), flush=True)
+        raise
+    print(closing(folder), flush=True)
+    ended = [run for run in runs(folder) if run.record_path.stat().st_mtime > began]
+    if any(run.read_record().get("status") != "finished" for run in ended):  # Optuna goes on without them
+        sys.exit(1)
+
+
+def runs(sweep: Path) -> list[RunFolder]:
+    """The run folders of a sweep, in the order of its jobs."""
+    folders = [RunFolder(path.parent) for path in sorted(sweep.glob("*/run.json"))]
+    return sorted(folders, key=lambda run: read_json(run.record_path).get("job") or 0)
+
+
+def closing(sweep: Path) -> str:
+    """What a sweep prints at its end."""
+    states = [run.read_record().get("status") for run in runs(sweep)]
+    counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
+    return f"\nsweep folder: {sweep} ({counts})\nnext: python -m pnu.report sweep={sweep}"
