@@ -157,6 +157,7 @@ def _multiply(
             mean, square = moments[chunk.number]
             torch.mv(out.t(), ones, out=mean).div_(numbers[chunk.number])
             deviation = torch.sub(out, mean, out=space[: len(out)])
+            mean += torch.mv(deviation.t(), ones).div_(numbers[chunk.number])  # what the first sum lost to rounding
             torch.mv(deviation.square_().t(), ones, out=square)
 
     spread(work, chunks)
