@@ -192,3 +192,35 @@ def test_far_neighbours_are_thinned_out() -> None:
 def test_reach_below_neighbours_is_refused() -> None:
     with pytest.raises(ValueError, match=r"model\.reach=20: expected at least model\.neighbours=24"):
         Surface(neighbours=24, reach=20)
+
+
+def test_parts_can_be_left_out() -> None:
+    cloud = wavy(200)
+    query = torch.cat([cloud[:30, :3] + 0.05 * cloud[:30, 3:], cloud[:30, 3:]], 1)
+    offsets, normals, hint = neighbourhoods(cloud, query, 24)
+    frame = local_frames(offsets, normals, hint, sphere=False)
+    assert not frame.base.any()
+    torch.testing.assert_close(frame.axes[:, 2], hint)
+    projector = Projector(attention=False)
+    assert (projector.shares(torch.randn(5, 24, 3)) == 1 / 24).all()
+    outputs = trained(rounds=1).outputs(cloud[None])
+    assert outputs["projected"].shape[0] == 1
+
+
+def test_most_doubtful_points_are_dropped() -> None:
+    model, cloud = trained(), wavy(300)
+    model.reject = 0.5
+    every = {}
+    project = model.in_batches
+
+    def spy(query: Tensor, *rest: object) -> tuple[Tensor, Tensor]:
+        every["last"] = project(query, *rest)  # type: ignore[arg-type]
+        return every["last"]
+
+    model.in_batches = spy  # type: ignore[method-assign]
+    dense = model.upsample_cloud(cloud, 600)
+    points, error = every["last"]
+    assert len(points) == 900
+    kept = torch.cdist(points[:, :3], dense[:, :3]).min(1).values < 1e-12
+    assert kept.sum() == 600
+    assert error[kept].max() <= error[~kept].min()

@@ -22,8 +22,9 @@ DENSE = 16  # neighbours that are all looked at; farther ones are thinned out
 class Projector(nn.Module):
     """One step onto the surface, for queries (m, 3) with rough normals, from their k nearest points and normals."""
 
-    def __init__(self, width: int = 64) -> None:
+    def __init__(self, width: int = 64, *, sphere: bool = True, attention: bool = True) -> None:
         super().__init__()
+        self.sphere, self.attend = sphere, attention
         self.first, self.second = nn.Linear(FEATURES, width), nn.Linear(width, width)
         self.context = nn.Linear(2 * width, width)
         self.third = nn.Linear(width, width)
@@ -38,12 +39,11 @@ class Projector(nn.Module):
 
         step (m, 3), unit normal (m, 3), logarithm of the expected error in spacings (m,), spacing (m, 1)."""
         with torch.no_grad():
-            frame = local_frames(offsets, normals, hint)
+            frame = local_frames(offsets, normals, hint, sphere=self.sphere)
         y = self.second(self.first(frame.features).relu()).relu()
-        context = self.context(torch.cat([y.amax(1), (y.softmax(1) * y).sum(1)], -1))
+        context = self.context(torch.cat([y.amax(1), (self.shares(y) * y).sum(1)], -1))
         y = (self.third(y) + context[:, None]).relu()
-        logits = self.attention(y)
-        share = logits.softmax(1)
+        share = self.shares(self.attention(y))
         out = self.out(self.head(torch.cat([y.amax(1), (share[..., :-2] * y).sum(1), context], -1)))
         # beside what the network finds freely, it chooses among the neighbours' normals and their bent planes
         bent = (share[..., -1] * frame.features[..., 7]).sum(1)
@@ -51,6 +51,10 @@ class Projector(nn.Module):
         normal = (share[..., -2:-1] * frame.features[..., 3:6]).sum(1) + out[:, 3:6]
         step, normal = ((v[:, None] @ frame.axes)[:, 0] for v in (step, normal))
         return frame.base + frame.spacing * step, normalize(normal, dim=-1), out[:, 6], frame.spacing
+
+    def shares(self, logits: Tensor) -> Tensor:
+        """Weights of the neighbours, for each of the features (m, k, c); all alike without attention."""
+        return logits.softmax(1) if self.attend else torch.full_like(logits, 1 / logits.shape[1])
 
 
 class Surface(nn.Module):
@@ -65,7 +69,10 @@ class Surface(nn.Module):
         seeds: seeds for each point wanted.
         candidates: seeds for each point wanted after they were thinned out to an even spacing.
         relaxation: steps of even spacing.
-        reject: share of the seeds with the highest expected error that is dropped.
+        reject: share of the points that is made too many; those with the highest expected error are dropped in the end.
+        queries: seeds of a crop, in training.
+        sphere: start from the sphere that fits the neighbours (algebraic point set surface), not from the seed.
+        attention: weigh the neighbours; without it all count alike.
     """
 
     predicts_normals = True
@@ -73,7 +80,8 @@ class Surface(nn.Module):
 
     def __init__(
         self, ratio: int = 4, neighbours: int = 24, reach: int = 24, width: int = 64, rounds: int = 2,
-        seeds: float = 3, candidates: float = 1.5, relaxation: int = 4, reject: float = 0.0, queries: int = 64,
+        seeds: float = 3, candidates: float = 1.5, relaxation: int = 4, reject: float = 0.01, queries: int = 64,
+        sphere: bool = True, attention: bool = True,
     ) -> None:  # fmt: skip
         super().__init__()
         if not 4 <= neighbours <= reach:
@@ -83,7 +91,7 @@ class Surface(nn.Module):
         self.ratio, self.neighbours, self.reach, self.rounds = ratio, neighbours, reach, rounds
         self.seeds, self.candidates, self.relaxation, self.reject = seeds, candidates, relaxation, reject
         self.queries = queries
-        self.projector = Projector(width)
+        self.projector = Projector(width, sphere=sphere, attention=attention)
 
     def outputs(self, patch: Tensor) -> dict[str, Tensor]:
         """Training: a seed for each of the first `queries` points of patches (B, n, 6), projected `rounds` times.
@@ -148,12 +156,12 @@ class Surface(nn.Module):
         hints = cloud[:, None, 3:].expand(-1, each, -1)
         query = torch.cat([cloud, torch.cat([discs, hints], -1).flatten(0, 1)])
         query = thin(query, round(self.candidates * count))
-        projected, error = self.in_batches(query, cloud, batch_size, progress, "projection")
-        kept = error.argsort()[: max(count, round((1 - self.reject) * len(error)))].sort().values
-        query = thin(projected[kept], count)
+        query, _ = self.in_batches(query, cloud, batch_size, progress, "projection")
+        query = thin(query, round((1 + self.reject) * count))
         if self.relaxation:
             query = torch.cat([repel(query[:, :3], query[:, 3:], steps=self.relaxation), query[:, 3:]], 1)
-        return self.in_batches(query, cloud, batch_size, progress, "refinement")[0]
+        dense, error = self.in_batches(query, cloud, batch_size, progress, "refinement")
+        return dense[error.argsort(stable=True)[:count].sort().values]
 
     def in_batches(
         self,

@@ -22,13 +22,13 @@ class LocalFrames(NamedTuple):
     features: Tensor  # (m, k, 11): position 0:3, normal 3:6, then lengths and products of them
 
 
-def local_frames(offsets: Tensor, normals: Tensor, hint: Tensor) -> LocalFrames:
+def local_frames(offsets: Tensor, normals: Tensor, hint: Tensor, *, sphere: bool = True) -> LocalFrames:
     """Frames for queries by offsets and normals (m, k, 3) of their neighbours, nearest first, and a rough normal.
 
     One step of an algebraic point set surface (`pnu.ops.apss`) gives foot and normal; neighbours that look away from
     the rough normal count little. The first axis is where normals change most, across an edge say, or where the
     neighbours spread most on a plane; the signs of both axes come from the third moment of the positions. So frames
-    turn, move and grow with the cloud.
+    turn, move and grow with the cloud. Without `sphere` the foot is the query and its normal the rough one.
     """
     dist = offsets.norm(dim=-1)
     spacing = dist.mean(1, keepdim=True).clamp(min=torch.finfo(dist.dtype).tiny)
@@ -36,7 +36,7 @@ def local_frames(offsets: Tensor, normals: Tensor, hint: Tensor) -> LocalFrames:
     facing = (1 + (normals * hint[:, None]).sum(-1)).clamp(min=2e-3) / 2
     weights = neighbour_weights((dist / spacing).square()) * facing.square()
     weights = weights / weights.sum(1, keepdim=True).clamp(min=torch.finfo(dist.dtype).tiny)
-    step, z = project_to_sphere(*fit_sphere(x, normals, weights))
+    step, z = project_to_sphere(*fit_sphere(x, normals, weights)) if sphere else (torch.zeros_like(hint), hint)
     step = step * (REACH / step.norm(dim=-1, keepdim=True).clamp(min=REACH))
     z = torch.where(z.norm(dim=-1, keepdim=True) > 0.5, z, hint)
     x = x - step[:, None]

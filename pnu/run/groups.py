@@ -71,7 +71,9 @@ class Model:
     seeds: float = doc("seeds for each point wanted")
     candidates: float = doc("of them, after thinning out to even spacing")
     relaxation: int = doc("steps of even spacing; 0: none")
-    reject: float = doc("share of the seeds with the highest expected error that is dropped")
+    reject: float = doc("share of points made too many; those with the highest expected error are dropped")
+    sphere: bool = doc("start from the sphere that fits the neighbours, not from the seed")
+    attention: bool = doc("weigh the neighbours; without it all count alike")
 
 
 @dataclass
