@@ -221,6 +221,6 @@ def test_most_doubtful_points_are_dropped() -> None:
     dense = model.upsample_cloud(cloud, 600)
     points, error = every["last"]
     assert len(points) == 900
-    kept = torch.cdist(points[:, :3], dense[:, :3]).min(1).values < 1e-12
+    kept = torch.isin(points[:, 0], dense[:, 0])
     assert kept.sum() == 600
     assert error[kept].max() <= error[~kept].min()
