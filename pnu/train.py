@@ -60,14 +60,15 @@ def train(cfg: Any) -> list[float] | None:
         record["device"] = str(trainer.strategy.root_device)
         start = run.last if run.last.exists() else None
         if start is None:
-            run.add_metrics("untrained", trainer.validate(module, data, verbose=False)[0])
+            run.add_metrics("untrained", trainer.validate(module, data, verbose=False))
         trainer.fit(module, data, ckpt_path=start, weights_only=True)
         if run.best.exists():
             module.load_state_dict(read(run.best)["state_dict"])
-        run.add_metrics("test", trainer.test(module, data, verbose=False)[0])
+        run.add_metrics("test", trainer.test(module, data, verbose=False))
+        result = objective(config, run)
     if is_main_process():
         print(run if config["quiet"] else job_line(run) if "job" in run.facts else closing(run))
-    return objective(config, run)
+    return result
 
 
 main = command(train, Train)

@@ -80,8 +80,7 @@ def job_folder(config: Mapping[str, Any]) -> RunFolder:
 
     hydra = HydraConfig.get()
     sweep, digest = Path(hydra.runtime.output_dir), config_hash(config)
-    label = ",".join(part.rpartition("/")[2] for part in str(hydra.job.override_dirname).split(",") if part)
-    label = re.sub(r"[^\w.,=+-]", "-", label.replace("setting=", ""))[:100] or str(config["name"])
+    label = label_of(str(hydra.job.override_dirname)) or str(config["name"])
     found = [run for run in runs(sweep) if read_json(run.record_path).get("config_hash") == digest]
     folder = found[0] if found else RunFolder(sweep / f"{label}_{digest[:8]}")
     folder.path.mkdir(parents=True, exist_ok=True)
@@ -94,6 +93,20 @@ def job_folder(config: Mapping[str, Any]) -> RunFolder:
     choices = hydra.runtime.choices
     folder.facts = {"job": hydra.job.num, "setting": choices.get("setting"), "ablation": choices.get("ablation")}
     return folder
+
+
+def label_of(overrides: str) -> str:
+    """A short name of what sets a job apart: "seed=0,setting=loss_terms/no_cd" becomes "no_cd,seed=0"."""
+    parts = []
+    for part in filter(None, overrides.split(",")):
+        key, _, value = part.partition("=")
+        try:
+            value = f"{float(value):.4g}"
+        except ValueError:
+            value = value.rpartition("/")[2]
+        parts.append(value if key == "setting" else f"{key}={value}")
+    parts.sort(key=lambda part: "=" in part)
+    return re.sub(r"[^\w.,=+-]", "-", ",".join(parts))[:100]
 
 
 def locked(path: Path) -> int:

@@ -26,7 +26,11 @@ def objective(config: Mapping[str, Any], run: RunFolder) -> list[float] | None:
     """
     if not config["objective"]:
         return None
-    found = read_json(run.metrics)["validation"]
+    found = read_json(run.metrics).get("validation")
+    if found is None:
+        raise ValueError(
+            "objective: no validation during the training; lower trainer.val_check_interval"
+        )
     missing = set(config["objective"]) - set(found)
     if missing:
         raise ValueError(f"objective={sorted(missing)}: expected some of {', '.join(sorted(set(found) - {'step'}))}")
