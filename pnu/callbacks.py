@@ -80,7 +80,7 @@ class Checkpoints(pl.Callback):
         if found[self.monitor] < self.best:
             self.best = found[self.monitor]
             trainer.save_checkpoint(self.run.best, weights_only=True)
-            self.run.add_metrics("validation", {**found, "step": trainer.global_step})
+            self.run.add_metrics("validation", [found, {"step": trainer.global_step}])
         if self.due:
             self.save_last(trainer)
 

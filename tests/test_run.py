@@ -343,15 +343,29 @@ def test_record_tells_running_then_finished(tmp_path: Path) -> None:
     assert found["config_hash"] == config_hash(CONFIG)
 
 
-@pytest.mark.parametrize(
-    ("error", "text"), [(ValueError("bad\nnews"), "ValueError: bad news"), (KeyboardInterrupt(), "interrupted")]
-)
-def test_record_tells_the_failure(tmp_path: Path, error: BaseException, text: str) -> None:
+def test_record_tells_the_failure(tmp_path: Path) -> None:
     run = RunFolder.create({**CONFIG, "run": str(tmp_path / "run")})
-    with pytest.raises(type(error)), run.recorded(CONFIG):
-        raise error
+    with pytest.raises(ValueError, match="bad"), run.recorded(CONFIG):
+        raise ValueError("bad\nnews")
     assert run.read_record()["status"] == "failed"
-    assert run.read_record()["error"] == text
+    assert run.read_record()["error"] == "ValueError: bad news"
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt(), SystemExit(1)])
+def test_an_interruption_tells_how_to_go_on(
+    tmp_path: Path, stop: BaseException, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = RunFolder.create({**CONFIG, "run": str(tmp_path / "run")})
+    with pytest.raises(SystemExit) as ended, run.recorded(CONFIG):
+        raise stop
+    assert ended.value.code == 130
+    assert run.read_record()["error"] == "interrupted"
+    assert capsys.readouterr().err == f"stopped; go on with: python -m pnu.train resume=true run={run}\n"
+
+
+def test_options_may_stand_between_overrides(script: Any) -> None:
+    done = script("input=a", "-m", "output=b", "ratio=2,3")
+    assert (done.returncode, done.stdout) == (0, "worked 2.0\nworked 3.0\n")
 
 
 def test_wall_time_adds_up_when_a_run_goes_on(tmp_path: Path) -> None:
@@ -389,7 +403,7 @@ def test_hash_is_of_what_is_computed() -> None:
 
 def test_metrics_are_put_together(tmp_path: Path) -> None:
     run = RunFolder.create({**CONFIG, "run": str(tmp_path / "run")})
-    run.add_metrics("untrained", {"val/chamfer_sq": 2.0})
-    run.add_metrics("test", {"test/chamfer_sq": 1.0, "test/flipped": 0.5})
+    run.add_metrics("untrained", [{"val/chamfer_sq": 2.0}])
+    run.add_metrics("test", [{"test/chamfer_sq": 1.0}, {"test/flipped": 0.5}])
     content = json.loads(run.metrics.read_text())
     assert content == {"untrained": {"chamfer_sq": 2.0}, "test": {"chamfer_sq": 1.0, "flipped": 0.5}}

@@ -394,3 +394,10 @@ def test_early_stopping_stops(train: Train) -> None:
     run = train("callbacks=early_stopping", "callbacks.early_stopping.patience=1", "optimizer=sgd", "optimizer.lr=0",
                 "trainer.max_epochs=9")  # fmt: skip
     assert read(run / "checkpoints/last.ckpt")["global_step"] < 36
+
+
+def test_without_validation_and_test(train: Train) -> None:
+    run = train("trainer.max_steps=1", "trainer.limit_val_batches=0", "trainer.limit_test_batches=0", "quiet=false")
+    assert record(run)["status"] == "finished"
+    assert json.loads((run / "metrics.json").read_text()) == {"untrained": {}, "test": {}}
+    assert not (run / "checkpoints/best.ckpt").exists()

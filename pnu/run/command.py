@@ -38,14 +38,15 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
             stop(error)
 
     def main(argv: Sequence[str] | None = None) -> None:
-        arguments = list(sys.argv[1:] if argv is None else argv)
+        # Hydra reads options only before the first override: `a=1 -m b=2` is as good as `-m a=1 b=2`
+        arguments = sorted(sys.argv[1:] if argv is None else argv, key=is_override)
         program = f"python -m pnu.{name}" if sys.argv[0].endswith(".py") else Path(sys.argv[0]).name
         import hydra
         from hydra._internal.utils import get_args_parser
 
         parsed = get_args_parser().parse_args(arguments)
         overrides = [o for o in parsed.overrides if not o.startswith("hydra.")]
-        goes_on = parsed.multirun and "sweep" in fields(schema)
+        goes_on = parsed.multirun and "trainer" in fields(schema)
         try:
             with composer(name, parsed.config_dir) as compose:
                 if parsed.help:
@@ -56,6 +57,7 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
                     arguments += added
                     parsed.overrides += added
                     overrides += [o for o in added if not o.startswith("hydra.")]
+                check_keys(next(variations(overrides)), schema, compose)  # before the config itself adds to the sweep
                 swept = sweep.parameters(overrides, compose) if parsed.multirun else []
                 for one in variations([*swept, *overrides]):
                     check_keys(one, schema, compose)
@@ -82,6 +84,10 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
     main.schema = schema  # type: ignore[attr-defined]
     main.__doc__ = schema.__doc__
     return main
+
+
+def is_override(argument: str) -> bool:
+    return not argument.startswith("-") and ("=" in argument or argument.startswith("~"))
 
 
 def stop(error: Exception) -> typing.NoReturn:

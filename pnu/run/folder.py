@@ -10,7 +10,7 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -85,11 +85,14 @@ class RunFolder:
     def read_record(self) -> dict[str, Any]:
         return read_json(self.record_path) if self.record_path.exists() else {}
 
-    def add_metrics(self, section: str, values: Mapping[str, float]) -> None:
-        """Put metrics under a section of metrics.json, such as "test"; their names lose their stage (test/...)."""
+    def add_metrics(self, section: str, results: Sequence[Mapping[str, float]]) -> None:
+        """Put metrics under a section of metrics.json, such as "test"; their names lose their stage (test/...).
+
+        results: what Lightning's trainer returns: one mapping for all data, or none where there were none.
+        """
         if is_main_process():
             known = read_json(self.metrics) if self.metrics.exists() else {}
-            values = {name.rpartition("/")[2]: float(value) for name, value in values.items()}
+            values = {name.rpartition("/")[2]: float(value) for found in results for name, value in found.items()}
             write_json(self.metrics, {**known, section: values})
 
     @contextmanager

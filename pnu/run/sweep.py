@@ -26,7 +26,7 @@ UNNAMED = ("sweep", "quiet")  # keys that do not make another sweep
 
 def sweep_name(overrides: Sequence[str], program: str) -> str:
     """The name of the sweep that a command line describes: the same for the same line."""
-    values = {o.key_or_group: o.get_value_element_as_str() for o in parse(list(overrides))}
+    values = {key: value for key, _, value in (override.partition("=") for override in overrides)}
     kept = sorted(f"{k}={v}" for k, v in values.items() if k not in UNNAMED and not k.startswith("hydra"))
     given = [values[key] for key in ("ablation", "hparams_search", "scale") if key in values]
     return "_".join([*(given or [program]), hashlib.sha256(" ".join(kept).encode()).hexdigest()[:6]])
