@@ -55,7 +55,7 @@ class PatchDataset(Dataset[dict[str, Any]]):
     ) -> None:
         self.path, self.rows, self.options, self.seed = Path(path), list(rows), options, seed
         self.augmentation, self.names = augmentation, names
-        self.opened: tuple[int, h5py.File] | None = None
+        self.opened: tuple[int, dict[str, h5py.Dataset]] | None = None
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -63,9 +63,10 @@ class PatchDataset(Dataset[dict[str, Any]]):
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"opened": None}
 
-    def file(self) -> h5py.File:
+    def file(self) -> dict[str, h5py.Dataset]:
+        """The file's datasets by name."""
         if self.opened is None or self.opened[0] != os.getpid():  # a handle shared across a fork reads wrong data
-            self.opened = os.getpid(), h5py.File(self.path, "r")
+            self.opened = os.getpid(), dict(h5py.File(self.path, "r"))
         return self.opened[1]
 
     def __getitem__(self, key: int | tuple[int, int]) -> dict[str, Any]:
