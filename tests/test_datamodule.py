@@ -224,6 +224,13 @@ def test_folder_without_meshes(tmp_path: Path) -> None:
         MeshDataModule(str(tmp_path)).patch_file()
 
 
+def test_two_meshes_of_one_name(tmp_path: Path) -> None:
+    for suffix in (".off", ".obj"):
+        write_mesh(tmp_path / f"dice{suffix}", shapes.make("dice"))
+    with pytest.raises(ValueError, match=r"dice.obj and .*dice.off are both named dice"):
+        MeshDataModule(str(tmp_path)).patch_file()
+
+
 def test_mesh_that_cannot_be_sampled_is_named(tmp_path: Path) -> None:
     (tmp_path / "flat.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n2 0 0\n3 0 1 2\n")
     with pytest.raises(ValueError, match="flat"):

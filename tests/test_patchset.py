@@ -84,6 +84,9 @@ def test_describe(file: Path) -> None:
     assert (figures["patches"], figures["shapes"], figures["points"]) == (5, 2, 4096)
     assert 0.01 < figures["spacing_over_radius"] < 0.05
     assert figures["share_with_sharp_edges"] == 1
+    assert figures["normals_of_length_1"] == 1
+    assert -1 <= figures["coordinates_from"] < -0.4 < 0.4 < figures["coordinates_to"] <= 1
+    assert figures["datasets"] == "edges (5, 256, 3) float32, name (5,) text, poisson_4096 (5, 4096, 6) float32"
 
 
 def cloud(n: int = 2, points: int = 128) -> np.ndarray:
@@ -96,7 +99,7 @@ def cloud(n: int = 2, points: int = 128) -> np.ndarray:
     ("content", "message"),
     [
         ({}, r"lacks the dataset poisson_4096 \(patches, points, 6\); it has nothing"),
-        ({"montecarlo_5k": cloud()}, r"lacks the dataset poisson_4096 .* it has montecarlo_5k \(2, 128, 6\)"),
+        ({"montecarlo_5k": cloud()}, r"lacks the dataset poisson_4096 .* it has montecarlo_5k \(2, 128, 6\) float64"),
         ({"poisson_4096": cloud()[..., :3]}, r"must have shape .*, found \(2, 128, 3\)"),
         ({"poisson_4096": cloud(points=20)}, r"must have shape .*, found \(2, 20, 6\)"),
         ({"poisson_4096": cloud()[0]}, r"must have shape .*, found \(128, 6\)"),
@@ -128,6 +131,30 @@ def test_no_file_and_no_hdf5(tmp_path: Path) -> None:
     (tmp_path / "text.h5").write_text("not a file of patches")
     with pytest.raises(ValueError, match="expected an HDF5 file of patches"):
         check(tmp_path / "text.h5")
+
+
+def test_damaged_and_forged_files_are_refused(file: Path, tmp_path: Path) -> None:
+    short = tmp_path / "short.h5"
+    short.write_bytes(file.read_bytes()[:-100_000])
+    with pytest.raises(ValueError, match=r"short.h5: expected an HDF5 file of patches, found .* a damaged file"):
+        check(short)
+    with h5py.File(tmp_path / "forged.h5", "w") as opened:  # a terabyte, none of it written
+        opened.create_dataset("poisson_4096", (10, 2**32, 6), "f4", chunks=(1, 4096, 6))
+    with pytest.raises(ValueError, match=r"poisson_4096 claims the shape \(10, 4294967296, 6\), more than the file"):
+        check(tmp_path / "forged.h5")
+    with h5py.File(tmp_path / "names.h5", "w") as opened:
+        opened["poisson_4096"] = cloud()
+        opened.create_dataset("name", (10**12,), h5py.string_dtype(), chunks=(1000,))
+    with pytest.raises(ValueError, match="name claims the shape"):
+        check(tmp_path / "names.h5")
+
+
+@pytest.mark.parametrize("value", ["no JSON", "[1, 2]", 5])
+def test_foreign_parameters_do_no_harm(tmp_path: Path, value: object) -> None:
+    with h5py.File(tmp_path / "foreign.h5", "w") as opened:
+        opened["poisson_4096"] = cloud()
+        opened.attrs["parameters"] = value
+    assert check(tmp_path / "foreign.h5").parameters == {}
 
 
 def test_too_few_patches() -> None:

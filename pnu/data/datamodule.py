@@ -15,9 +15,7 @@ from pnu.data import shapes
 from pnu.data.augment import from_options
 from pnu.data.dataset import Downsampling, EpochSampler, Options, PatchDataset, check_options, split
 from pnu.data.patchset import build, check
-from pnu.io import Mesh, read_mesh
-
-MESH_SUFFIXES = (".ply", ".off", ".obj", ".stl")
+from pnu.io import MESH_SUFFIXES, Mesh, read_mesh
 
 
 class PatchDataModule(pl.LightningDataModule):
@@ -169,11 +167,11 @@ class GeneratedDataModule(PatchDataModule):
         digest = hashlib.sha256(json.dumps(parameters, sort_keys=True).encode()).hexdigest()[:12]
         path = self.cache / f"{parameters['source']}_{self.patches}_{digest}.h5"
         if not path.exists():
-            processes = min(
-                len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 8
-            )
+            makers = self.makers()
+            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+            processes = min(cores, 8, 1 + len(makers) // 8)  # to start one takes as long as several shapes
             build(
-                path, self.makers(), self.patches, seed=self.shape_seed, parameters=parameters, processes=processes,
+                path, makers, self.patches, seed=self.shape_seed, parameters=parameters, processes=processes,
                 progress=None if self.quiet else functools.partial(bar, description=f"cut patches into {path}"),
             )  # fmt: skip
         return path
@@ -226,7 +224,13 @@ class MeshDataModule(GeneratedDataModule):
         found = sorted(path for path in root.rglob("*") if path.suffix.lower() in MESH_SUFFIXES)
         if not found:
             raise ValueError(f"data.root={root}: expected meshes (ply, off, obj, stl), found none")
-        return {path.relative_to(root).with_suffix("").as_posix().replace("/", "_"): path for path in found}
+        files: dict[str, Path] = {}
+        for path in found:
+            name = path.relative_to(root).with_suffix("").as_posix().replace("/", "_")
+            if name in files:  # the same shape twice would be in training and in validation
+                raise ValueError(f"data.root={root}: {files[name]} and {path} are both named {name}; rename or move one")
+            files[name] = path
+        return files
 
     def makers(self) -> dict[str, Callable[[], Mesh]]:
         return {name: functools.partial(read_mesh, path) for name, path in self.files.items()}

@@ -21,6 +21,7 @@ PATCH_POINTS = 4096
 EDGE_POINTS = 256
 SHARES = (0.3, 0.1)  # of its shape that a patch covers
 OVERSAMPLING = 5  # random points from which each of the evenly spread ones is chosen
+DENSEST = 100  # bytes that a byte of the file may stand for; compressed coordinates stay far below, forged headers not
 
 
 class Patches(NamedTuple):
@@ -138,45 +139,70 @@ def check(path: str | Path) -> Contents:
     if not path.is_file():
         raise ValueError(f"{path}: no such file; expected an HDF5 file of patches as data/README.md describes")
     try:
-        file = h5py.File(path, "r")
-    except OSError:
+        with h5py.File(path, "r") as file:
+            return contents_of(path, file)
+    except (OSError, RuntimeError):  # what h5py raises where bytes are missing or wrong
         raise ValueError(f"{path}: expected an HDF5 file of patches, found something else or a damaged file") from None
-    with file:
-        clouds = file.get("poisson_4096")
-        if not isinstance(clouds, h5py.Dataset):
-            raise ValueError(f"{path}: lacks the dataset poisson_4096 (patches, points, 6); it has {listing(file)}")
-        if clouds.ndim != 3 or clouds.shape[2] != 6 or clouds.shape[0] < 1 or clouds.shape[1] < 64:
-            raise ValueError(
-                f"{path}: poisson_4096 must have shape (patches, 64 or more points, 6), found {clouds.shape}"
-            )
-        if clouds.dtype.kind != "f":
-            raise ValueError(f"{path}: poisson_4096 must hold floating-point numbers, found {clouds.dtype}")
-        sample = clouds[:: max(1, len(clouds) // 8)]
-        if not np.isfinite(sample).all():
-            raise ValueError(f"{path}: poisson_4096 holds NaN or infinity")
-        length = np.linalg.norm(sample[..., 3:], axis=-1)
-        if not (np.abs(length - 1) < 0.01).mean() > 0.99:
-            raise ValueError(
-                f"{path}: columns 4 to 6 of poisson_4096 must be unit normals, found lengths {length.min():.3g} to"
-                f" {length.max():.3g}"
-            )
-        names = names_of(path, file, len(clouds))
-        given = file.get("montecarlo_1024")
-        if given is not None and (given.ndim != 3 or given.shape[0] != clouds.shape[0] or given.shape[2] != 6):
-            raise ValueError(f"{path}: montecarlo_1024 must have shape ({len(clouds)}, points, 6), found {given.shape}")
-        edges = file.get("edges")
-        if edges is not None and (edges.ndim != 3 or edges.shape[0] != clouds.shape[0] or edges.shape[2] != 3):
-            raise ValueError(f"{path}: edges must have shape ({len(clouds)}, points, 3), found {edges.shape}")
+
+
+def contents_of(path: Path, file: h5py.File) -> Contents:
+    clouds = dataset(path, file, "poisson_4096")
+    if clouds is None:
+        raise ValueError(f"{path}: lacks the dataset poisson_4096 (patches, points, 6); it has {listing(file)}")
+    if clouds.ndim != 3 or clouds.shape[2] != 6 or clouds.shape[0] < 1 or clouds.shape[1] < 64:
+        raise ValueError(f"{path}: poisson_4096 must have shape (patches, 64 or more points, 6), found {clouds.shape}")
+    if clouds.dtype.kind != "f":
+        raise ValueError(f"{path}: poisson_4096 must hold floating-point numbers, found {clouds.dtype}")
+    sample = clouds[:: -(-len(clouds) // 8)]
+    if not np.isfinite(sample).all():
+        raise ValueError(f"{path}: poisson_4096 holds NaN or infinity")
+    length = np.linalg.norm(sample[..., 3:], axis=-1)
+    if not (np.abs(length - 1) < 0.01).mean() > 0.99:
+        raise ValueError(
+            f"{path}: columns 4 to 6 of poisson_4096 must be unit normals, found lengths {length.min():.3g} to"
+            f" {length.max():.3g}"
+        )
+    names = names_of(path, file, len(clouds))
+    given = dataset(path, file, "montecarlo_1024")
+    if given is not None and (given.ndim != 3 or given.shape[0] != len(clouds) or given.shape[2] != 6):
+        raise ValueError(f"{path}: montecarlo_1024 must have shape ({len(clouds)}, points, 6), found {given.shape}")
+    edges = dataset(path, file, "edges")
+    if edges is not None and (edges.ndim != 3 or edges.shape[0] != len(clouds) or edges.shape[2] != 3):
+        raise ValueError(f"{path}: edges must have shape ({len(clouds)}, points, 3), found {edges.shape}")
+    return Contents(clouds.shape[0], clouds.shape[1], names, edges is not None, given is not None, parameters_of(file))
+
+
+def dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset | None:
+    """A dataset of the file itself; ValueError where the file is far too small for the size that it claims."""
+    found = file.get(name)
+    if not isinstance(found, h5py.Dataset):
+        return None
+    if found.shape is None or found.size * found.dtype.itemsize > DENSEST * path.stat().st_size:
+        raise ValueError(f"{path}: {name} claims the shape {found.shape}, more than the file can hold; it is damaged")
+    return found
+
+
+def parameters_of(file: h5py.File) -> dict[str, Any]:
+    """What the file was made from; nothing in a foreign file."""
+    try:
         parameters = json.loads(file.attrs.get("parameters", "{}"))
-        return Contents(clouds.shape[0], clouds.shape[1], names, edges is not None, given is not None, parameters)
+    except (TypeError, ValueError):
+        return {}
+    return parameters if isinstance(parameters, dict) else {}
 
 
 def listing(file: h5py.File) -> str:
-    return ", ".join(f"{name} {getattr(item, 'shape', 'group')}" for name, item in file.items()) or "nothing"
+    items = (
+        f"{name} {item.shape} {'text' if item.dtype.kind in 'OS' else item.dtype}"
+        if isinstance(item, h5py.Dataset)
+        else f"{name} (a group)"
+        for name, item in file.items()
+    )
+    return ", ".join(items) or "nothing"
 
 
 def names_of(path: Path, file: h5py.File, patches: int) -> list[str] | None:
-    names = file.get("name")
+    names = dataset(path, file, "name")
     if names is None:
         return None
     if names.shape not in ((patches,), (patches, 1)):
@@ -186,23 +212,28 @@ def names_of(path: Path, file: h5py.File, patches: int) -> list[str] | None:
 
 
 def describe(path: str | Path) -> dict[str, Any]:
-    """Figures of a patch file: patches, shapes, points, median spacing and extent of a patch, edges, parameters."""
+    """Figures of a patch file: its datasets, shapes, spacing and extent of patches, range of coordinates, normals."""
     contents = check(path)
     with h5py.File(path, "r") as file:
         clouds = file["poisson_4096"]
-        sample = clouds[:: max(1, len(clouds) // 32)]
-        spacing = [np.median(cKDTree(cloud[:, :3]).query(cloud[:, :3], 2)[0][:, 1]) for cloud in sample]
-        radius = [np.linalg.norm(cloud[:, :3] - cloud[:, :3].mean(0), axis=1).max() for cloud in sample]
+        sample = clouds[:: -(-len(clouds) // 32)].astype(float)
+        points, normals = sample[..., :3], sample[..., 3:]
+        spacing = [np.median(cKDTree(cloud).query(cloud, 2)[0][:, 1]) for cloud in points]
+        radius = np.linalg.norm(points - points.mean(1, keepdims=True), axis=-1).max(1)
         sharp = float(np.isfinite(file["edges"][:, 0, 0]).mean()) if contents.has_edges else None
+        datasets = listing(file)
     return {
         "file": str(path),
         "size_MB": round(Path(path).stat().st_size / 1e6, 1),
+        "datasets": datasets,
         "patches": contents.patches,
         "points": contents.points,
         "shapes": len(set(contents.names)) if contents.names else None,
-        "spacing_over_radius": float(np.median(np.array(spacing) / np.array(radius))),
+        "spacing_over_radius": float(np.median(np.array(spacing) / radius)),
         "radius_median": float(np.median(radius)),
+        "coordinates_from": float(points.min()),
+        "coordinates_to": float(points.max()),
+        "normals_of_length_1": float((np.abs(np.linalg.norm(normals, axis=-1) - 1) < 1e-3).mean()),
         "share_with_sharp_edges": sharp,
-        "montecarlo_1024": contents.has_input,
         "parameters": contents.parameters,
     }
