@@ -228,7 +228,9 @@ class MeshDataModule(GeneratedDataModule):
         for path in found:
             name = path.relative_to(root).with_suffix("").as_posix().replace("/", "_")
             if name in files:  # the same shape twice would be in training and in validation
-                raise ValueError(f"data.root={root}: {files[name]} and {path} are both named {name}; rename or move one")
+                raise ValueError(
+                    f"data.root={root}: {files[name]} and {path} are both named {name}; rename or move one"
+                )
             files[name] = path
         return files
 
