@@ -22,6 +22,7 @@ LAYERS = [
     {"pnu.evaluation"},
     {"pnu.comparison"},
     {"pnu.run", "pnu.schema"},
+    {"pnu.study"},
     {"pnu.lit", "pnu.callbacks"},
 ]
 HEAVY = {"torch", "lightning", "hydra", "open3d", "tensorboard", "torchmetrics", "scipy", "h5py", "trimesh"}

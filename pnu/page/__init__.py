@@ -81,7 +81,7 @@ def write_page(
         "colors": json.dumps([round(float(v), 4) for v in scale.ravel() / 255]),
         "views": json.dumps([encode(view) for view in views]).replace("<", "\\u003c"),  # nothing ends the element
         "ogl": assets["ogl.min.js"],
-        "viewer": assets["viewer.js"],
+        "viewer": assets["sort.js"] + assets["viewer.js"],
     }
     first, *rest = assets["page.html"].split("{{")
     text = first + "".join(values[name] + after for name, _, after in (part.partition("}}") for part in rest))
@@ -90,7 +90,7 @@ def write_page(
     return len(text.encode())
 
 
-ASSETS = ("page.html", "style.css", "viewer.js", "ogl.min.js")
+ASSETS = ("page.html", "style.css", "sort.js", "viewer.js", "ogl.min.js")
 
 
 def paragraphs(lines: Sequence[str]) -> str:

@@ -1,0 +1,213 @@
+"""A report's files: Markdown, CSV and one HTML page that needs nothing else."""
+
+import csv
+import html
+import io
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from pnu import page
+from pnu.io import atomic_path
+from pnu.run.table import SHOWN
+from pnu.study.pictures import sheets
+from pnu.study.plots import plots
+from pnu.study.settings import Run, Setting, Study, short
+
+READING = (
+    "Mean and standard deviation over seeds of the test's metrics, each patch in its unit sphere. In brackets the"
+    " difference to the baseline; in bold where it is greater than the spread, the standard deviation of the difference"
+    " of two runs. With few seeds that is a hint, not a proof."
+)
+
+
+def write_report(study: Study, folder: Path) -> list[Path]:
+    """Write report.md, report.html, summary.csv, runs.csv and the figures, each atomically; their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = plots(study)
+    pictures = {shape: webp(picture) for shape, picture in sheets(study).items()}
+    contents: dict[str, bytes] = {
+        "report.md": markdown(study, drawn, list(pictures)).encode(),
+        "report.html": page_html(study, drawn, pictures).encode(),
+        "summary.csv": table_csv(summary_rows(study)).encode(),
+        "runs.csv": table_csv(run_rows(study)).encode(),
+        **{f"{name}.svg": svg.encode() for name, (_, svg) in drawn.items()},
+        **{f"cloud_{shape}.webp": picture for shape, picture in pictures.items()},
+    }
+    for name, content in contents.items():
+        with atomic_path(folder / name) as temporary:
+            temporary.write_bytes(content)
+    return [folder / name for name in contents]
+
+
+def webp(picture: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, "WEBP", quality=80)
+    return buffer.getvalue()
+
+
+def facts(study: Study) -> list[str]:
+    """What the reader must know of the runs."""
+    finished = [run for setting in study.settings for run in setting.runs]
+    hours = sum(float(run.record.get("wall_s", 0)) for run in finished) / 3600
+    counts = sorted({len(setting.runs) for setting in study.settings})
+    revisions = {str(run.record.get("git")) for run in finished}
+    seeds = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+    lines = [
+        f"{len(study.settings)} settings, {seeds} seeds each, {len(finished)} finished runs, {hours:.2f} hours.",
+        f"Baseline: {study.baseline.name}.",
+    ]
+    if len(revisions) > 1:
+        lines.append(f"The runs are of {len(revisions)} revisions of the program: {', '.join(sorted(revisions))}.")
+    if study.unfinished:
+        lines.append(f"{len(study.unfinished)} runs have not finished, see the end.")
+    return lines
+
+
+def command_of(study: Study) -> str:
+    command = str(study.baseline.runs[0].record.get("command", ""))
+    return command.partition("-m pnu.train")[1] and "python -m pnu.train" + command.partition("-m pnu.train")[2]
+
+
+def head(metric: str) -> str:
+    return SHOWN[metric][0]
+
+
+def digits(metric: str) -> str:
+    return SHOWN[metric][2]
+
+
+def cell(study: Study, setting: Setting, metric: str) -> tuple[str, bool]:
+    """Mean, spread and difference as one reads them, and whether the difference exceeds the spread."""
+    summary = study.summary(setting, metric)
+    if summary is None:
+        return "-", False
+    factor, form = SHOWN[metric][1:]
+    text = format(factor * summary.mean, form)
+    if summary.spread is not None:
+        text += f" ± {format(factor * summary.spread, form)}"
+    if summary.difference is not None:
+        text += f" ({format(factor * summary.difference, '+' + form)})"
+    return text, bool(summary.exceeds)
+
+
+def differing(setting: Setting, baseline: Setting) -> str:
+    """The keys in which a setting differs from the baseline."""
+    keys = dict.fromkeys([*setting.values, *baseline.values])
+    found = {key: setting.values.get(key, "-") for key in keys if setting.values.get(key) != baseline.values.get(key)}
+    return ", ".join(f"{key}={short(value)}" for key, value in found.items())
+
+
+def failures(study: Study) -> list[str]:
+    return [f"{run.folder.path.name}: {status(run)}" for run in study.unfinished]
+
+
+def status(run: Run) -> str:
+    state = str(run.record.get("status", "no record"))
+    if state == "running":
+        return "running, or ended without a word (kill, power cut); the same command goes on with it"
+    return f"{state}: {run.record.get('error', '')}"
+
+
+def markdown(study: Study, drawn: dict[str, tuple[str, str]], shapes: Sequence[str]) -> str:
+    metrics = study.metrics
+    lines = [f"# {study.folder.name}", "", *facts(study), ""]
+    if command := command_of(study):
+        lines += ["```", command, "```", ""]
+    lines += [READING, "", f"| | setting | {' | '.join(head(metric) for metric in metrics)} | differs in |"]
+    lines.append("|---|---|" + "---:|" * len(metrics) + "---|")
+    for i, setting in enumerate(study.settings):
+        cells = [f"**{text}**" if beyond else text for text, beyond in (cell(study, setting, m) for m in metrics)]
+        differs = "baseline" if i == 0 else differing(setting, study.baseline)
+        lines.append(f"| {i} | {setting.name} | {' | '.join(cells)} | {differs} |")
+    for name, (caption, _) in drawn.items():
+        lines += ["", f"## {caption}", "", f"![{caption}]({name}.svg)"]
+    if shapes:
+        lines += ["", "## The same validation clouds for each setting: input, prediction, target; colours are normals"]
+    for shape in shapes:
+        lines += ["", f"![{shape}](cloud_{shape}.webp)"]
+    if study.unfinished:
+        lines += ["", "## Runs that have not finished", "", *(f"- {text}" for text in failures(study))]
+    return "\n".join(lines) + "\n"
+
+
+def page_html(study: Study, drawn: dict[str, tuple[str, str]], pictures: dict[str, bytes]) -> str:
+    parts = [page.paragraphs(facts(study))]
+    if command := command_of(study):
+        parts.append(f"<pre>{html.escape(command)}</pre>")
+    parts.append(page.paragraphs([READING]))
+    parts.append(table_html(study))
+    for caption, svg in drawn.values():
+        parts.append(f"<h2>{html.escape(caption)}</h2>\n<figure>{svg}</figure>")
+    if pictures:
+        parts.append("<h2>The same validation clouds for each setting</h2>")
+        parts.append(page.paragraphs(["Input, prediction and target of the first seed; colours are normals."]))
+    parts += [page.figure(shape, picture) for shape, picture in pictures.items()]
+    if study.unfinished:
+        items = "".join(f"<li>{html.escape(text)}</li>" for text in failures(study))
+        parts.append(f'<h2>Runs that have not finished</h2><ul class="failures">{items}</ul>')
+    values = {
+        "title": html.escape(study.folder.name),
+        "style": files("pnu.page").joinpath("style.css").read_text("utf-8"),
+        "sort": files("pnu.page").joinpath("sort.js").read_text("utf-8"),
+        "body": "\n".join(parts),
+    }
+    first, *rest = files(__package__).joinpath("page.html").read_text("utf-8").split("{{")
+    return first + "".join(values[name] + after for name, _, after in (part.partition("}}") for part in rest))
+
+
+def table_html(study: Study) -> str:
+    """Sorted by a click on a head: numbers by their means."""
+    heads = "".join(f'<th scope="col">{html.escape(head(metric))}</th>' for metric in study.metrics)
+    rows = []
+    for i, setting in enumerate(study.settings):
+        cells = []
+        for metric in study.metrics:
+            text, beyond = cell(study, setting, metric)
+            kind = ' class="beyond"' if beyond else ""
+            value = repr(setting.mean(metric)) if setting.of(metric) else ""
+            cells.append(f'<td{kind} data-value="{value}">{html.escape(text)}</td>')
+        name = f"{i} {setting.name}"
+        title = "baseline" if i == 0 else differing(setting, study.baseline)
+        reference = ' class="reference"' if i == 0 else ""
+        first = f'<td data-value="{i}" title="{html.escape(title)}">{html.escape(name)}</td>'
+        rows.append(f"<tr{reference}>{first}{''.join(cells)}</tr>")
+    return (
+        '<div class="scroll"><table class="sortable"><thead><tr><th scope="col">setting</th>'
+        f"{heads}</tr></thead>\n<tbody>\n{chr(10).join(rows)}\n</tbody></table></div>"
+    )
+
+
+def summary_rows(study: Study) -> list[dict[str, Any]]:
+    rows = []
+    for setting in study.settings:
+        for metric in study.metrics:
+            summary = study.summary(setting, metric)
+            if summary is not None:
+                known = {"setting": setting.name, "metric": metric, "runs": len(setting.of(metric))}
+                rows.append(known | summary._asdict() | {"differs": differing(setting, study.baseline)})
+    return rows
+
+
+def run_rows(study: Study) -> list[dict[str, Any]]:
+    """A row for each run, those that have not finished too."""
+    named = [(setting.name, run) for setting in study.settings for run in setting.runs]
+    rows = []
+    for name, run in [*named, *(("", run) for run in study.unfinished)]:
+        row = {"setting": name, "seed": run.seed, "status": run.record.get("status"), "run": run.folder.path.name}
+        row |= {metric: run.metrics.get(metric) for metric in study.metrics}
+        rows.append(row | {"wall_s": run.record.get("wall_s"), "error": run.record.get("error")})
+    return rows
+
+
+def table_csv(rows: Sequence[dict[str, Any]]) -> str:
+    """Numbers in full, nothing for None."""
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return buffer.getvalue()
