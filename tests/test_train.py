@@ -1,6 +1,7 @@
 """Trainings through the real entry point, on a file of a few small patches."""
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,7 @@ import pnu
 from pnu import callbacks
 from pnu.checkpoint import newest_run, read
 from pnu.run.config import config_folder
+from pnu.run.sweep import locked
 from pnu.train import main
 
 Train = Callable[..., Path]
@@ -297,6 +299,14 @@ def test_what_a_run_has_learnt_cannot_change(finished: Path, capsys: pytest.Capt
 def test_resume_needs_a_run_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "resume=true needs run=FOLDER" in refused(capsys, ["resume=true"])
     assert "expected a run folder with config.yaml" in refused(capsys, ["resume=true", f"run={tmp_path}"])
+
+
+def test_a_run_is_not_resumed_while_it_runs(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    held = locked(finished)
+    try:
+        assert "another process runs this job; wait for it" in refused(capsys, [f"run={finished}", "resume=true"])
+    finally:
+        os.close(held)
 
 
 def test_a_run_is_not_overwritten(train: Train, finished: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -55,6 +55,7 @@ def open_run(cfg: Any, schema: type) -> tuple[RunFolder, dict[str, Any]]:
         run = RunFolder.existing(config["run"])
         config = restored(run, config, overrides, schema)
         if is_main_process():
+            run.lock = sweep.locked(run.path)
             run.write_config(config)
         return run, config
     if not is_main_process():
@@ -63,6 +64,7 @@ def open_run(cfg: Any, schema: type) -> tuple[RunFolder, dict[str, Any]]:
             raise ValueError("run=FOLDER must be given where torchrun or SLURM starts the processes: all need the same")
         return RunFolder(path), config
     run = RunFolder.create(config)
+    run.lock = sweep.locked(run.path)
     os.environ[VARIABLE] = str(run.path.absolute())
     return run, config
 
