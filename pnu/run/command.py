@@ -40,6 +40,8 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
     def main(argv: Sequence[str] | None = None) -> None:
         # Hydra reads options only before the first override: `a=1 -m b=2` is as good as `-m a=1 b=2`
         arguments = sorted(sys.argv[1:] if argv is None else argv, key=is_override)
+        # before torch is there: on a busy machine, threads that spin while they wait make a step take seconds
+        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         program = f"python -m pnu.{name}" if sys.argv[0].endswith(".py") else Path(sys.argv[0]).name
         import hydra
         from hydra._internal.utils import get_args_parser
