@@ -134,7 +134,10 @@ def mean_curve(setting: Setting, name: str, points: int = 200) -> Curve:
 
     by_step: defaultdict[float, list[float]] = defaultdict(list)
     for run in setting.runs:
-        events = EventAccumulator(str(run.folder.path / "tensorboard"), size_guidance={"scalars": 0}).Reload()
+        folder = run.folder.path / "tensorboard"
+        if not folder.is_dir():
+            return []
+        events = EventAccumulator(str(folder), size_guidance={"scalars": 0}).Reload()
         if name not in events.Tags()["scalars"]:
             return []
         curve = [(float(event.step), event.value) for event in events.Scalars(name)]
