@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from pnu import checkpoint
 from pnu.io import Cloud, check_cloud
 from pnu.ops import patches
+from pnu.ops.attributes import carry
 from pnu.ops.nearest import nearest
 from pnu.ops.normalize import Frame, unit_sphere_frame
 from pnu.ops.normals import estimate_normals, flip_to_reference
@@ -64,7 +65,9 @@ def upsample(
         points: (n, 3), n >= 16, in any unit and anywhere.
         normals: (n, 3), of any length but zero; estimated and oriented where missing.
         ratio: points out for each point in, any number >= 1.
-        model: network, run folder, or None for the newest finished run under outputs/.
+        model: network, run folder, file of weights, or the name of weights that come with pnu (`pnu.weights`); "surface"
+            takes those made for estimated normals where none are given. None: the newest finished run under
+            outputs/, or "surface" where there is none.
         patch_size: points of a patch; default: what the network was made for (1024).
         device: "auto" (where the given network is; else CUDA where there is one), "cpu", "cuda", "cuda:1" ...
         batch_size: patches at once on a GPU, by default 64; on the CPU each thread takes one.
@@ -83,7 +86,7 @@ def upsample(
     for name, value in (("patch_size", patch_size), ("batch_size", batch_size)):
         if value is not None and value < 1:
             raise ValueError(f"{name}={value}: expected a whole number >= 1")
-    network, target = _on_device(model, device)
+    network, target = _on_device(model if isinstance(model, nn.Module) else source(model, normals), device)
     upsampler = network if isinstance(network, CloudUpsampler) else Patchwise(network, patch_size)
     sparse, frame = _prepare(given, progress)
     generator = torch.Generator().manual_seed(seed)
@@ -100,6 +103,18 @@ def upsample(
     return frame.from_unit(dense[None])[0].numpy()
 
 
+def attributes(dense: np.ndarray, cloud: Cloud) -> dict[str, np.ndarray]:
+    """Colours and scalars of a cloud at the points of its denser version (m, 6), see `pnu.ops.attributes`."""
+    if not cloud.attributes:
+        return {}
+    normals = cloud.normals
+    if normals is None:
+        normals = estimate_normals(torch.from_numpy(cloud.points)[None])[0].numpy()
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    sparse = np.hstack([cloud.points, normals / np.maximum(length, 1e-300)])
+    return {name: carry(dense, sparse, values) for name, values in cloud.attributes.items()}
+
+
 def output_count(n: int, ratio: float) -> int:
     """round(ratio n), or `ValueError` for a ratio that is no number >= 1 or asks for more than 1e9 points."""
     if not 1 <= ratio < float("inf"):
@@ -110,6 +125,12 @@ def output_count(n: int, ratio: float) -> int:
     return count
 
 
+def source(model: str | PathLike[str] | None, normals: np.ndarray | None) -> str | PathLike[str]:
+    """What `checkpoint.load` takes, for a cloud with these normals."""
+    model = model or checkpoint.newest_run() or "surface"
+    return "surface_estimated" if model == "surface" and normals is None else model
+
+
 def newest_run() -> Path:
     """The run that finished last under outputs/; `ValueError` if there is none."""
     run = checkpoint.newest_run()
@@ -118,10 +139,8 @@ def newest_run() -> Path:
     return run
 
 
-def _on_device(model: nn.Module | str | PathLike[str] | None, device: str) -> tuple[nn.Module, torch.device]:
+def _on_device(model: nn.Module | str | PathLike[str], device: str) -> tuple[nn.Module, torch.device]:
     """The network, and the device it now lies on."""
-    if model is None:
-        model = newest_run()
     given = isinstance(model, nn.Module)
     network = model if isinstance(model, nn.Module) else checkpoint.load(model)
     if device != "auto":

@@ -21,7 +21,7 @@ class Upsample:
 
     input: str = doc("file to read: ply, xyz, txt, pcd, obj, off or npy")
     output: str = doc("file to write; its suffix says the format")
-    run: str | None = doc("run folder with the network; null: the newest finished one under outputs/")
+    run: str | None = doc("run folder, or weights that come with pnu: surface ...; null: the newest run, or surface")
     ratio: float = doc("points out for each point in, any number >= 1")
     normals: str = doc("auto: the file's, estimated where it has none; estimate: always estimated")
     patch_size: int | None = doc("points of a patch; null: what the network was made for")
@@ -46,13 +46,13 @@ def upsample(cfg: Any) -> None:
     cloud = io.read_cloud(cfg.input, normals=cfg.normals == "auto")
     origin = "with normals" if cloud.normals is not None else "normals estimated and oriented"
     say(f"input:  {cfg.input}, {len(cloud.points)} points, {origin}")
-    if cloud.attributes:
-        say(f"        left out: {', '.join(cloud.attributes)} (points and normals are upsampled, nothing else)")
 
     from pnu import inference
 
-    run = cfg.run or inference.newest_run()
-    say(f"run:    {run}{'' if cfg.run else ' (the newest finished one)'}")
+    run = inference.source(cfg.run, cloud.normals)
+    say(
+        f"run:    {run}{'' if cfg.run else ' (the newest finished one)' if Path(run).is_dir() else ' (comes with pnu)'}"
+    )
     with progress_bar(cfg.quiet) as progress:
         dense = inference.upsample(
             cloud.points,
@@ -65,7 +65,10 @@ def upsample(cfg: Any) -> None:
             seed=cfg.seed,
             progress=progress,
         )
-    io.write_cloud(cfg.output, dense[:, :3], dense[:, 3:])
+    attributes = inference.attributes(dense, cloud) if io.keeps_attributes(cfg.output) else {}
+    io.write_cloud(cfg.output, dense[:, :3], dense[:, 3:], attributes)
+    if cloud.attributes:
+        say(f"        {'carried over' if attributes else 'left out'}: {', '.join(cloud.attributes)}")
     say(f"output: {cfg.output}, {len(dense)} points with unit normals, {time.perf_counter() - started:.1f} s")
     say(f"next:   python -m pnu.reconstruct input={cfg.output} output=mesh.ply")
 

@@ -270,12 +270,6 @@ def test_bad_arguments(case: str) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_no_run_to_take(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match="no finished run under outputs/; train one with `make train`, or give run="):
-        upsample(GOOD)
-
-
 def test_public_function_survives_the_import_of_its_module() -> None:
     code = (
         "import pnu, pnu.inference as i; assert pnu.upsample is i.upsample; import pnu.upsample; pnu.upsample(points=1)"
@@ -298,3 +292,14 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True,
                           cwd=Path(__file__).parents[1])  # fmt: skip
     assert int(done.stdout) < 1000  # MiB
+
+
+def test_surface_model_where_there_is_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    cloud = sphere(300)
+    for normals in (cloud, None):
+        dense = upsample(cloud, normals, ratio=7.3)
+        assert dense.shape == (2190, 6)
+        assert abs(np.linalg.norm(dense[:, :3], axis=1) - 1).max() < 0.1
+        assert (dense[:, :3] * dense[:, 3:]).sum(1).min() > 0.8
+        np.testing.assert_array_equal(dense, upsample(cloud, normals, ratio=7.3, model="surface"))

@@ -72,7 +72,8 @@ def test_given_run_quiet_and_estimated_normals(place: Path) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     np.testing.assert_array_equal(np.load(place / "a.npy"), np.load(place / "b.npy"))
     done = upsample(place, "input=inward.ply", "output=c.pcd", f"run={run}", "ratio=1")
-    assert "left out: colors (points and normals are upsampled, nothing else)" in done.stdout
+    assert "carried over: colors" in done.stdout
+    assert (read_cloud(place / "c.pcd").attributes["colors"] == 0).all()
     assert len(read_cloud(place / "c.pcd").points) == 200
 
 
@@ -136,12 +137,12 @@ def test_no_bar_before_an_error(place: Path) -> None:
 
 
 def test_no_run_at_all(tmp_path: Path) -> None:
-    write_cloud(tmp_path / "cloud.ply", np.random.default_rng(0).normal(size=(20, 3)))
-    done = upsample(tmp_path, *GOOD, "quiet=true")
-    assert done.returncode == 2
-    expected = "error: run: no finished run under outputs/; train one with `make train`, or give run=FOLDER\n"
-    assert (done.stdout, done.stderr) == ("", expected)
-    assert [path.name for path in tmp_path.iterdir()] == ["cloud.ply"]
+    """Weights that come with pnu take over, and the command says so."""
+    points = np.random.default_rng(0).normal(size=(100, 3))
+    write_cloud(tmp_path / "cloud.ply", points / np.linalg.norm(points, axis=1, keepdims=True))
+    done = upsample(tmp_path, *GOOD)
+    assert done.returncode == 0, done.stderr
+    assert "run:    surface_estimated (comes with pnu)" in done.stdout
 
 
 def test_help_names_every_key(tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ class Surface(nn.Module):
 
     def __init__(
         self, ratio: int = 4, neighbours: int = 24, reach: int = 24, width: int = 64, rounds: int = 2,
-        seeds: float = 3, candidates: float = 1.5, relaxation: int = 4, reject: float = 0.01, queries: int = 64,
+        seeds: float = 3, candidates: float = 1.5, relaxation: int = 4, reject: float = 0.003, queries: int = 64,
         sphere: bool = True, attention: bool = True,
     ) -> None:  # fmt: skip
         super().__init__()

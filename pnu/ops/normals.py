@@ -20,11 +20,12 @@ from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 
 from pnu.ops.nearest import knn, nearest
+from pnu.ops.noise import noise_level
 from pnu.ops.sampling import farthest_points_large
 
 ANCHORS = 4096  # points whose dipoles all see each other: 64 MiB a matrix
 ROWS = 2**16  # points treated at once in local steps
-FIELD_NEIGHBORS = 48
+SOME_NOISE = 0.1  # in spacings, until it can be measured
 
 
 def estimate_normals(points: Tensor, k: int = 16, *, orient: bool = True) -> Tensor:
@@ -36,30 +37,27 @@ def estimate_normals(points: Tensor, k: int = 16, *, orient: bool = True) -> Ten
     """
     if not 3 <= k <= points.shape[1]:
         raise ValueError(f"k: expected 3 to {points.shape[1]} neighbours (the number of points), found {k}")
-    idx = knn(points, points, k).idx
-    planes = torch.stack([_plane_normals(cloud, near) for cloud, near in zip(points.detach(), idx, strict=True)])
-    if not orient:
-        return planes
-    return torch.stack([_refined(cloud, lines) for cloud, lines in zip(points.detach(), planes, strict=True)])
+    points = points.detach()
+    planes = [_plane_normals(xyz, near) for xyz, near in zip(points, knn(points, points, k).idx, strict=True)]
+    if orient:
+        planes = [_refined(_Cloud.of(xyz), lines) for xyz, lines in zip(points, planes, strict=True)]
+    return torch.stack(planes).to(points)
 
 
 def orient_normals(points: Tensor, normals: Tensor) -> Tensor:
-    """The same unit normals (n, 3) of points (n, 3), each with the sign that makes them agree.
+    """The same normals (n, 3) of points (n, 3), each with the sign that makes them agree.
 
     Outward on closed shapes, whatever their number; the same side all over on an open sheet. Deterministic; beyond 4096
     points the global step sees an even subset, so that time stays linear.
     """
     cloud = _Cloud.of(points)
-    return normals * _signs(cloud, normals.to(cloud.points))[:, None].to(normals)
+    lines = torch.nn.functional.normalize(normals.to(cloud.points), dim=1)
+    return normals * _signs(cloud, lines)[:, None].to(normals)
 
 
 def refit_normals(points: Tensor, normals: Tensor) -> Tensor:
-    """Oriented normals (n, 3) of points (n, 3), fitted again to the neighbours on the same sheet; signs stay."""
-    cloud = _Cloud.of(points)
-    turned = normals.to(cloud.points)
-    for _ in range(4):
-        turned = _field(cloud, turned)
-    return _sheet_normals(cloud, turned).to(points.dtype)
+    """What `estimate_normals` makes of points (n, 3) once it knows their sides, those of normals (n, 3)."""
+    return _refined(_Cloud.of(points), normals, oriented=True).to(points)
 
 
 def flip_to_reference(normals: Tensor, points: Tensor, ref_points: Tensor, ref_normals: Tensor) -> Tensor:
@@ -82,17 +80,12 @@ class _Cloud(NamedTuple):
         points = points.detach().double()
         points = points - points.mean(0)
         points = (points / points.norm(dim=1).max().clamp_min(1e-30)).float()
-        k = min(FIELD_NEIGHBORS, len(points))
+        few, k = min(8, len(points)), min(48, len(points))
         dist_sq, idx = (found[0] for found in knn(points[None], points[None], k))
-        few = min(8, k)
-        spacing = dist_sq[:, 1 : min(6, k)].sqrt().mean(1)[idx[:, :few]].mean(1)
+        spacing = dist_sq[:, 1:6].sqrt().mean(1)[idx[:, :few]].mean(1)
         area = (dist_sq[:, few - 1] * (torch.pi / (few - 0.5)))[idx[:, :few]].median(1).values
         floor = (0.1 * spacing.median()).clamp_min(1e-6)  # duplicates
         return _Cloud(points, idx, spacing.clamp_min(floor), area.clamp_min(floor**2))
-
-    def part(self, keep: Tensor) -> _Cloud:
-        """A subset as a cloud of its own."""
-        return _Cloud.of(self.points[keep])
 
 
 def _plane_normals(points: Tensor, idx: Tensor, weight: Tensor | None = None) -> Tensor:
@@ -103,45 +96,66 @@ def _plane_normals(points: Tensor, idx: Tensor, weight: Tensor | None = None) ->
         share = torch.ones_like(near[..., :1]) if weight is None else weight[rows, :, None].double()
         near = near - (share * near).sum(1, keepdim=True) / share.sum(1, keepdim=True)
         normals.append(torch.linalg.eigh(near.mT @ (share * near))[1][:, :, 0])
-    return torch.cat(normals).to(points.dtype)
+    return torch.cat(normals)
 
 
-def _refined(points: Tensor, lines: Tensor) -> Tensor:
-    return refit_normals(points, orient_normals(points, lines))
+def _refined(cloud: _Cloud, lines: Tensor, *, oriented: bool = False) -> Tensor:
+    """Oriented normals from lines (n, 3). Each turn of field and fit leaves cleaner lines for the next."""
+    normals, noise = lines.to(cloud.points), SOME_NOISE
+    for rounds in (3, 2):
+        if not oriented:
+            normals = normals * _signs(cloud, normals)[:, None]
+        for _ in range(rounds):
+            normals = _field(cloud, normals, noise)
+        normals = _sheet_normals(cloud, normals, noise)
+        noise = noise_level(cloud.points, normals) / cloud.spacing.median().item()
+    return normals
 
 
-def _signs(cloud: _Cloud, normals: Tensor) -> Tensor:
-    """+1 or -1 for each normal, (n,)."""
-    n = len(normals)
-    anchors = torch.arange(n, device=normals.device)
-    if n > ANCHORS:
-        anchors = torch.from_numpy(farthest_points_large(cloud.points, ANCHORS)).to(normals.device)
-    few = cloud if n <= ANCHORS else cloud.part(anchors)
-    sign = _global_signs(few, normals[anchors])
-    if n > ANCHORS:
-        sign = _spread(cloud, normals, anchors, sign)
+def _signs(cloud: _Cloud, lines: Tensor) -> Tensor:
+    """+1 or -1 for each line, (n,)."""
+    if len(lines) <= ANCHORS:
+        sign = _global_signs(cloud, lines)
+    else:
+        anchors = torch.from_numpy(farthest_points_large(cloud.points, ANCHORS)).to(lines.device)
+        sign = _spread(cloud, lines, anchors, _global_signs(_Cloud.of(cloud.points[anchors]), lines[anchors]))
     for _ in range(3):
-        turned = _field(cloud, normals * sign[:, None])
-        sign = torch.where((turned * normals).sum(1) < 0, -1.0, 1.0)
+        turned = _field(cloud, lines * sign[:, None], SOME_NOISE)
+        sign = torch.where((turned * lines).sum(1) < 0, -1.0, 1.0)
     return sign
 
 
-def _global_signs(cloud: _Cloud, normals: Tensor) -> Tensor:
+def _global_signs(cloud: _Cloud, lines: Tensor) -> Tensor:
     points, area = cloud.points, cloud.area
-    width_sq = cloud.spacing**2
-    dist_sq = (points @ points.T).mul_(-2) + points.square().sum(1)[:, None] + points.square().sum(1)
-    dist_sq = torch.maximum(dist_sq, (width_sq[:, None] + width_sq) / 2)
-    along = (points * normals).sum(1) - points @ normals.T  # n_i.(p_i - p_j) at [j, i]
-    layer = along / dist_sq**1.5 * (area.sqrt() * area.sqrt()[:, None] / (4 * torch.pi))
-    sign = torch.where(_least_squares(layer, 0.5 * area.sqrt(), 4) < 0, -1.0, 1.0)
-    dipole = (normals @ normals.T + 3 * along * along.T / dist_sq) / dist_sq**1.5 * area
-    dipole.fill_diagonal_(0)
+    along = (points * lines).sum(1) - points @ lines.T  # n_i.(p_i - p_j) at [j, i]
+    layer = _inverse_distances(cloud, 1.0).pow_(3).mul_(along).mul_(area.sqrt())
+    layer.mul_(area.sqrt()[:, None] / (4 * torch.pi))
+    half = 0.5 * area.sqrt()
+    start = torch.where(_least_squares(layer, half, 4) < 0, -1.0, 1.0)
+    # narrow dipoles keep thin walls apart, wide ones see past noise: Gauss' law tells which did better
+    settled = [_settled(cloud, lines, along, start, width) for width in (1.0, 1.4, 2.0)]
+    return min(settled, key=lambda sign: (layer @ (sign * area.sqrt()) - half).norm().item())
+
+
+def _settled(cloud: _Cloud, lines: Tensor, along: Tensor, sign: Tensor, width: float) -> Tensor:
+    """Signs turned along the field of all dipoles until they agree with it."""
+    inverse = _inverse_distances(cloud, width)
+    dipole = (along * along.T).mul_(inverse).mul_(inverse).mul_(3).addmm_(lines, lines.T)
+    dipole.mul_(inverse.pow_(3)).mul_(cloud.area).fill_diagonal_(0)
     for _ in range(20):
-        settled = torch.where(dipole @ sign < 0, -1.0, 1.0)
-        if torch.equal(settled, sign):
+        turned = torch.where(dipole @ sign < 0, -1.0, 1.0)
+        if torch.equal(turned, sign):
             break
-        sign = settled
+        sign = turned
     return sign
+
+
+def _inverse_distances(cloud: _Cloud, width: float) -> Tensor:
+    """1 / max(distance, width x spacing) between all points, (n, n)."""
+    width_sq = (width * cloud.spacing) ** 2 / 2
+    dist_sq = cloud.points.square().sum(1) + cloud.points.square().sum(1)[:, None]
+    dist_sq.addmm_(cloud.points, cloud.points.T, alpha=-2)
+    return torch.maximum(dist_sq, width_sq + width_sq[:, None], out=dist_sq).rsqrt_()
 
 
 def _least_squares(matrix: Tensor, target: Tensor, steps: int) -> Tensor:
@@ -186,8 +200,9 @@ def _spread(cloud: _Cloud, normals: Tensor, anchors: Tensor, sign: Tensor) -> Te
     return agree
 
 
-def _field(cloud: _Cloud, normals: Tensor, width: float = 1.4) -> Tensor:
+def _field(cloud: _Cloud, normals: Tensor, noise: float) -> Tensor:
     """Minus the gradient of the neighbours' winding number at each point, as unit vectors (n, 3)."""
+    width = 1 + 3 * noise
     out = []
     for rows in torch.arange(len(normals), device=normals.device).split(ROWS):
         idx = cloud.idx[rows, 1:]
@@ -200,15 +215,19 @@ def _field(cloud: _Cloud, normals: Tensor, width: float = 1.4) -> Tensor:
     return torch.cat(out)
 
 
-def _sheet_normals(cloud: _Cloud, normals: Tensor, k: int = 32) -> Tensor:
+def _sheet_normals(cloud: _Cloud, normals: Tensor, noise: float) -> Tensor:
     """Plane fits to the neighbours that face the same way and lie near the tangent plane, signs kept."""
-    idx = cloud.idx[:, :k]
-    offset = cloud.points[idx] - cloud.points[:, None]
-    distance = offset.norm(dim=-1)
-    reach = distance[:, -1:] / 1.5
-    rise = (offset * normals[:, None]).sum(-1).abs() + (offset * normals[idx]).sum(-1).abs()
-    facing = (normals[:, None] * normals[idx]).sum(-1).clamp_min(0)
-    weight = facing**4 * torch.exp(-((distance / reach) ** 2) - (rise / (0.5 * reach)) ** 2)
-    weight[:, 0] = 1
-    fitted = _plane_normals(cloud.points, idx, weight)
-    return torch.where((fitted * normals).sum(1, keepdim=True) < 0, -fitted, fitted)
+    k = round(32 * min(1 + 3 * noise, 1.5))
+    fitted = []
+    for rows in torch.arange(len(normals), device=normals.device).split(ROWS):
+        idx, normal = cloud.idx[rows, :k], normals[rows, None]
+        offset = cloud.points[idx] - cloud.points[rows, None]
+        distance = offset.norm(dim=-1)
+        reach = distance[:, -1:] / 1.5
+        rise = (offset * normal).sum(-1).abs() + (offset * normals[idx]).sum(-1).abs()
+        facing = (normal * normals[idx]).sum(-1).clamp_min(0) ** (4 / (1 + 6 * noise))
+        weight = facing * torch.exp(-((distance / reach) ** 2) - (rise / ((0.5 + 3 * noise) * reach)) ** 2)
+        weight[:, 0] = 1
+        fitted.append(_plane_normals(cloud.points, idx, weight).to(normals))
+    lines = torch.cat(fitted)
+    return torch.where((lines * normals).sum(1, keepdim=True) < 0, -lines, lines)

@@ -1,5 +1,6 @@
 """A search by Optuna that goes on from its storage."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,8 @@ def arguments(hydra: Any) -> list[str]:
     study = optuna.load_study(study_name=sweeper.study_name, storage=storage)
     for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
         study.tell(trial.number, state=TrialState.FAIL)
-        study.enqueue_trial(trial.params)
+        with warnings.catch_warnings(action="ignore"):  # "experimental" since 2020
+            study.enqueue_trial(trial.params)
     ended = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE, TrialState.PRUNED))
     added = [f"hydra.sweeper.n_trials={max(0, sweeper.n_trials - len(ended))}"]
     if sweeper.sampler.get("seed") is not None:

@@ -28,9 +28,7 @@ def objective(config: Mapping[str, Any], run: RunFolder) -> list[float] | None:
         return None
     found = read_json(run.metrics).get("validation")
     if found is None:
-        raise ValueError(
-            "objective: no validation during the training; lower trainer.val_check_interval"
-        )
+        raise ValueError("objective: no validation during the training; lower trainer.val_check_interval")
     missing = set(config["objective"]) - set(found)
     if missing:
         raise ValueError(f"objective={sorted(missing)}: expected some of {', '.join(sorted(set(found) - {'step'}))}")
