@@ -65,8 +65,8 @@ def upsample(
         points: (n, 3), n >= 16, in any unit and anywhere.
         normals: (n, 3), of any length but zero; estimated and oriented where missing.
         ratio: points out for each point in, any number >= 1.
-        model: network, run folder, file of weights, or the name of weights that come with pnu (`pnu.weights`); "surface"
-            takes those made for estimated normals where none are given. None: the newest finished run under
+        model: network, run folder, file of weights, or the name of weights that come with pnu (`pnu.weights`):
+            "surface" takes those made for estimated normals where none are given. None: the newest finished run under
             outputs/, or "surface" where there is none.
         patch_size: points of a patch; default: what the network was made for (1024).
         device: "auto" (where the given network is; else CUDA where there is one), "cpu", "cuda", "cuda:1" ...
