@@ -2,6 +2,7 @@
 PYTHON ?= python3
 VENV   ?= .venv
 ARGS   ?=
+ABLATION ?= normals
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
@@ -33,8 +34,9 @@ test: $(STAMP)   ## the test suite (minutes); ARGS="-m slow" for the slow ones
 train: $(STAMP)   ## train the paper's network on embedded data: a small success in minutes
 	$(BIN)/python -m pnu.train experiment=quickstart $(ARGS)
 
-sweep: $(STAMP)   ## a small sweep of one loss weight over two values
-	$(BIN)/python -m pnu.train -m experiment=quickstart loss.w3=0,0.05 $(ARGS)
+sweep: $(STAMP)   ## a small ablation and its report in minutes: make sweep ABLATION=loss_terms
+	$(BIN)/python -m pnu.train -m ablation=$(ABLATION) scale=small hydra/launcher=joblib hydra.launcher.n_jobs=2 $(ARGS)
+	$(BIN)/python -m pnu.report
 
 board: $(STAMP)   ## TensorBoard over outputs/
 	@$(BIN)/python -m pnu.doctor --require

@@ -3,6 +3,7 @@
 import inspect
 import logging
 import math
+import os
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -45,6 +46,13 @@ def quieten() -> None:
         logging.getLogger(name).setLevel(logging.ERROR)
     for message in NOISE:
         warnings.filterwarnings("ignore", message=message)
+
+
+def keep_threads() -> None:
+    """Let OMP_NUM_THREADS decide how many threads torch uses: joblib gives its processes an MKL_NUM_THREADS of its own,
+    which torch takes instead, and another number of threads rounds differently."""
+    if os.environ.get("OMP_NUM_THREADS", "").isdigit():
+        torch.set_num_threads(max(1, int(os.environ["OMP_NUM_THREADS"])))
 
 
 class NonFinite(ValueError):

@@ -42,6 +42,7 @@ def train(cfg: Any) -> list[float] | None:
         from pnu.checkpoint import read
 
         lit.quieten()
+        lit.keep_threads()
         pl.seed_everything(config["seed"], verbose=False)
         data = build(config["data"], "pnu.data")
         model = models.build(config["model"])
