@@ -102,10 +102,10 @@ def _plane_normals(points: Tensor, idx: Tensor, weight: Tensor | None = None) ->
 def _refined(cloud: _Cloud, lines: Tensor, *, oriented: bool = False) -> Tensor:
     """Oriented normals from lines (n, 3). Each turn of field and fit leaves cleaner lines for the next."""
     normals, noise = lines.to(cloud.points), SOME_NOISE
-    for rounds in (3, 2):
+    for _ in range(2):
         if not oriented:
             normals = normals * _signs(cloud, normals)[:, None]
-        for _ in range(rounds):
+        for _ in range(5):
             normals = _field(cloud, normals, noise)
         normals = _sheet_normals(cloud, normals, noise)
         noise = noise_level(cloud.points, normals) / cloud.spacing.median().item()
@@ -230,4 +230,6 @@ def _sheet_normals(cloud: _Cloud, normals: Tensor, noise: float) -> Tensor:
         weight[:, 0] = 1
         fitted.append(_plane_normals(cloud.points, idx, weight).to(normals))
     lines = torch.cat(fitted)
-    return torch.where((lines * normals).sum(1, keepdim=True) < 0, -lines, lines)
+    cosine = (lines * normals).sum(1, keepdim=True)
+    # a fit across the given normal has found something else than its sheet
+    return torch.where(cosine.abs() < 0.3, normals, lines * cosine.sign())
