@@ -15,6 +15,7 @@ class Train:
     name: str = doc("last part of the run folder's name")
     run: str | None = doc("run folder; null: outputs/<date>/<time>_<name>")
     resume: bool = doc("go on with the run in run=FOLDER, with its config, from its last checkpoint")
+    threads: int | None = doc("threads of a training on the CPU; null: one for each core; small patches want one")
     quiet: bool = doc("print the run folder alone")
     sweep: str | None = doc("name of a sweep (-m) below outputs/sweeps; null: made of the command line")
     objective: list[str] | None = doc("validation metrics that a search (hparams_search) makes small")
@@ -37,12 +38,15 @@ def train(cfg: Any) -> list[float] | None:
         return objective(config, run)
     with run.recorded(config) as record:
         import lightning.pytorch as pl  # seconds: only once the config is known to be good
+        import torch
 
         from pnu import callbacks, lit, models
         from pnu.checkpoint import read
 
         lit.quieten()
         lit.keep_threads()
+        if config["threads"]:
+            torch.set_num_threads(config["threads"])
         pl.seed_everything(config["seed"], verbose=False)
         data = build(config["data"], "pnu.data")
         model = models.build(config["model"])
