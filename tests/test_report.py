@@ -114,6 +114,18 @@ def test_effects_are_of_one_number_alone(make: Make) -> None:
     }
 
 
+def test_effects_of_a_search_are_of_all_its_trials(make: Make) -> None:
+    for job in range(6):
+        folder = make(job, None, 0, 0.1 * job + 0.1, w1=float(job), w3=0.1 * job)
+    assert {key: len(pairs) for key, pairs in effects(collect(folder)).items()} == {"loss.w1": 6, "loss.w3": 6}
+
+
+def test_terms_left_out_are_no_effect_of_a_number(make: Make) -> None:
+    for job, loss in enumerate([{}, {"w3": 0.0}, {"w1": 0.0}, {"w1": 0.0, "w3": 0.0}]):
+        folder = make(job, None, 0, 0.1 * job + 0.1, **loss)
+    assert effects(collect(folder)) == {}
+
+
 @pytest.mark.parametrize("content", [[], ["failed"]])
 def test_nothing_to_report(content: list[str], tmp_path: Path, make: Make, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "sweep").mkdir()

@@ -165,7 +165,8 @@ def effects(study: Study) -> dict[str, list[tuple[float, Setting]]]:
         same = [s for s in study.settings if all(s.values.get(k) == v for k, v in base.items() if k != key)]
         if len(same) > 2 or len(same) == len(study.settings) > 1:
             alone[key] = by_value(key, same)
-    return alone or {key: by_value(key, study.settings) for key in keys if len(study.settings) > 2}
+    searched = [key for key in keys if len({setting.values[key] for setting in study.settings}) > 4]
+    return alone or {key: by_value(key, study.settings) for key in searched}
 
 
 def by_value(key: str, settings: Sequence[Setting]) -> list[tuple[float, Setting]]:
