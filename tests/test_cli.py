@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -177,18 +176,3 @@ def test_two_processes_train_one_model(tmp_path: Path, small: list[str]) -> None
     (run,) = tmp_path.glob("outputs/*/*")
     assert json.loads((run / "run.json").read_text())["status"] == "finished"
     assert read(run / "checkpoints/last.ckpt")["global_step"] == 4  # 10 patches in batches of 2 in two processes
-
-
-@pytest.mark.slow
-def test_works_from_an_installed_wheel(tmp_path: Path) -> None:
-    """conf/ travels inside the package: the wheel's files alone, in another folder, answer --help."""
-    build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(tmp_path), str(ROOT)]
-    subprocess.run(build, check=True, capture_output=True)
-    (wheel,) = tmp_path.glob("*.whl")
-    shutil.unpack_archive(wheel, tmp_path / "site", "zip")
-    done = train(tmp_path, "--help", PYTHONPATH=str(tmp_path / "site"))
-    assert done.returncode == 0, done.stderr
-    where = [sys.executable, "-c", "import pnu.run.config as c; print(c.config_folder())"]
-    environment = os.environ | {"PYTHONPATH": str(tmp_path / "site")}
-    found = subprocess.run(where, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout
-    assert found.strip() == str(tmp_path / "site/pnu/conf")

@@ -1,0 +1,94 @@
+"""The wheel: installed alone in another folder, every command works from any directory."""
+
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+ALL_HELP = """
+import contextlib, importlib.metadata, io, pathlib, sys, pnu
+site = sys.argv[1]
+(found,) = importlib.metadata.distributions(name="pnu", path=[site])
+scripts = [entry for entry in found.entry_points if entry.group == "console_scripts"]
+print(pathlib.Path(pnu.__file__).parent)
+for script in scripts:
+    sys.argv = [script.name, "--help"]
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        script.load()()
+    assert "quiet" in said.getvalue() and script.name in said.getvalue(), said.getvalue()
+    print(script.name)
+"""
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    copy = folder / "source"  # the checkout stays as it is
+    for name in ("pnu", "conf"):
+        shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, copy)
+    pip("wheel", "--no-build-isolation", "--wheel-dir", folder, copy)
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def site(wheel: Path) -> Path:
+    pip("install", "--target", wheel.parent / "site", wheel)
+    return wheel.parent / "site"
+
+
+def pip(command: str, *arguments: str | Path) -> None:
+    quiet = [sys.executable, "-m", "pip", command, "--quiet", "--disable-pip-version-check", "--no-deps"]
+    done = subprocess.run([*quiet, *map(str, arguments)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def run(site: Path, folder: Path, *command: str | Path) -> str:
+    environment = os.environ | {"PYTHONPATH": str(site)}
+    done = subprocess.run(list(map(str, command)), cwd=folder, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_wheel_holds_what_the_package_reads(wheel: Path) -> None:
+    packed = set(zipfile.ZipFile(wheel).namelist())
+    wanted = {f"pnu/{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "conf").rglob("*.yaml")}
+    files = [path for path in (ROOT / "pnu").rglob("*") if path.is_file() and "__pycache__" not in path.parts]
+    wanted |= {path.relative_to(ROOT).as_posix() for path in files}
+    assert {"pnu/conf/train.yaml", "pnu/py.typed", "pnu/weights/surface.safetensors", "pnu/page/page.html"} <= wanted
+    assert wanted - packed == set()
+    assert any(name.endswith("licenses/LICENSE") for name in packed)
+    assert {name.split("/")[0].partition("-")[0] for name in packed} == {"pnu"}
+
+
+def test_every_command_has_a_script() -> None:
+    commands = {path.stem for path in (ROOT / "pnu").glob("*.py") if "main = command(" in path.read_text()}
+    assert {f"pnu-{name}": f"pnu.{name}:main" for name in commands} == SCRIPTS
+
+
+def test_every_script_answers_from_another_directory(site: Path, tmp_path: Path) -> None:
+    package, *answered = run(site, tmp_path, sys.executable, "-c", ALL_HELP, site).split()
+    assert Path(package) == site / "pnu"
+    assert set(answered) == set(SCRIPTS)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_installed_script_upsamples_with_the_shipped_weights(site: Path, tmp_path: Path) -> None:
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    np.savetxt(tmp_path / "sphere.xyz", np.hstack([points, points]))
+    script = site / "bin" / "pnu-upsample"
+    run(site, tmp_path, script, "input=sphere.xyz", "output=dense.xyz", "run=surface", "ratio=2", "quiet=true")
+    dense = np.loadtxt(tmp_path / "dense.xyz")
+    assert dense.shape == (400, 6)
+    assert np.abs(np.linalg.norm(dense[:, :3], axis=1) - 1).max() < 0.1
