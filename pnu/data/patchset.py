@@ -177,6 +177,8 @@ def dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset | None:
     found = file.get(name)
     if not isinstance(found, h5py.Dataset):
         return None
+    if found.file != file or found.external or found.is_virtual:  # a file from elsewhere reads no other one here
+        raise ValueError(f"{path}: {name} lies in another file; copy its numbers into this one")
     if found.shape is None or found.size * found.dtype.itemsize > DENSEST * path.stat().st_size:
         raise ValueError(f"{path}: {name} claims the shape {found.shape}, more than the file can hold; it is damaged")
     return found
