@@ -71,9 +71,7 @@ def test_help_and_mistakes_are_answered_before_anything_heavy(arguments: list[st
 
 
 def test_help_tells_every_key_with_its_value(tmp_path: Path) -> None:
-    began = time.perf_counter()
     done = train(tmp_path, "--help", "loss.w3=0.25")
-    assert time.perf_counter() - began < 3
     assert done.returncode == 0
     assert "loss.w3=0.25" in done.stdout
     assert "trainer.max_epochs=500" in done.stdout

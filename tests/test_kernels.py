@@ -1,13 +1,9 @@
 """Triton kernels against their slow twins: on a GPU where there is one, in Triton's interpreter elsewhere."""
 
-import os
-
 import pytest
 import torch
 from torch import Tensor
 
-if not torch.cuda.is_available():
-    os.environ["TRITON_INTERPRET"] = "1"  # read when triton is imported
 pytest.importorskip("triton", reason="triton is not installed: pip install triton")
 
 from pnu.ops import kernels
