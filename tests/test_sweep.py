@@ -18,6 +18,8 @@ from pnu.run.sweep import arguments, check_job, label_of, sweep_name
 from pnu.train import Train, main
 from tests.test_train import patch_file  # noqa: F401  a fixture
 
+pytestmark = pytest.mark.slow  # real sweeps in processes of their own: minutes on two cores
+
 ABLATIONS = sorted(path.stem for path in (config_folder() / "ablation").glob("*.yaml"))
 SETTINGS = sorted(
     path.relative_to(config_folder() / "setting").as_posix().removesuffix(".yaml")
