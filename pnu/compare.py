@@ -98,7 +98,7 @@ SETTINGS = ("methods", "kinds", "points", "truth_points", "ratio", "normals", "s
 
 def upsamplers(cfg: Any) -> dict[str, "Upsampler"]:
     """The methods by name. ValueError for one that is neither a run folder nor a classical method, or named twice."""
-    from pnu import checkpoint, classical, evaluation
+    from pnu import checkpoint, classical, evaluation, weights
 
     found: dict[str, Upsampler] = {}
     for method in cfg.methods:
@@ -107,8 +107,10 @@ def upsamplers(cfg: Any) -> dict[str, "Upsampler"]:
             model, name = classical.method(folder), name or folder
         elif Path(folder).is_dir():
             model, name = checkpoint.load(folder), name or Path(folder).resolve().name
+        elif weights.find(folder):
+            model, name = checkpoint.load(folder), name or Path(folder).stem
         else:
-            known = ", ".join(classical.METHODS)
+            known = ", ".join([*classical.METHODS, *weights.names()])
             raise ValueError(f"methods={method}: expected a run folder, or one of {known}; found neither")
         if name in found or name in ("input", "floor", "truth"):
             raise ValueError(f"methods={method}: the name {name} is taken; give another one, methods=[NAME:{folder}]")
