@@ -3,7 +3,7 @@
 A field maps points (n, 3) to values (n,), negative inside; close to the surface it is about the signed distance.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +11,10 @@ from numpy.typing import ArrayLike
 from pnu.io import Mesh
 
 Field = Callable[[np.ndarray], np.ndarray]
+
+BLOCK = 4  # grid points along a side of the blocks that are skipped where the surface is far
+STEEPEST = 2.5  # of a field, with a margin
+FINE = 20_000  # faces; a mesh of fewer shows its facets
 
 
 def sphere(center: ArrayLike, radius: float) -> Field:
@@ -82,17 +86,15 @@ def surface_nets(field: Field, bound: ArrayLike, cells: int = 72) -> Mesh:
     """Zero level of a field inside the box |x| <= bound, one vertex in each cell that the surface crosses.
 
     Gibson's surface nets: a cell's vertex is the mean of the crossings on its edges; here Newton steps along the
-    field's gradient then put it on the surface itself. `cells` counts along the longest side. The surface must not
+    field's gradient then put it on the surface itself. `cells` counts along the longest side. A mesh of few faces, as
+    thin shapes have, is refined: its faces lie within about 3 degrees of the surface in the mean. The surface must not
     reach the box.
     """
     bound = np.broadcast_to(np.asarray(bound, float), 3)
     step = 2 * bound.max() / cells
     size = np.ceil(2 * bound / step).astype(int) + 1
     axes = [step * (np.arange(n) - (n - 1) / 2) for n in size]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    values = np.concatenate([field(part) for part in np.array_split(grid, max(1, len(grid) // 50_000))])
-    values[values == 0] = 1e-12
-    values = values.reshape(size)
+    values = sampled(field, axes, step)
 
     crossings, cells_of, outward = [], [], []
     strides = np.array([size[1] * size[2], size[2], 1])
@@ -117,7 +119,41 @@ def surface_nets(field: Field, bound: ArrayLike, cells: int = 72) -> Mesh:
     mean = np.stack([np.bincount(quads.ravel(), w, len(used)) for w in where.T], axis=1) / count[:, None]
     vertices = project((mean - (size - 1) / 2) * step, field, step)
     quads = np.where(np.concatenate(outward)[:, None], quads, quads[:, ::-1])
-    return Mesh(vertices, split_quads(vertices, quads))
+    faces = split_quads(vertices, quads)
+    if len(faces) < FINE:
+        known = len(vertices)
+        vertices, faces = subdivided(vertices, faces)
+        vertices[known:] = project(vertices[known:], field, step / 2, rounds=1)
+    return Mesh(vertices, faces)
+
+
+def sampled(field: Field, axes: Sequence[np.ndarray], step: float) -> np.ndarray:
+    """Values on a grid, none of them 0; in blocks that the surface does not reach, their middle's."""
+    size = [len(axis) for axis in axes]
+    blocks = [-(-n // BLOCK) for n in size]
+    middles = [axis[0] + step * (BLOCK * np.arange(n) + (BLOCK - 1) / 2) for axis, n in zip(axes, blocks, strict=True)]
+    coarse = field(np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1).reshape(-1, 3)).reshape(blocks)
+    values = coarse
+    for axis in range(3):
+        values = np.repeat(values, BLOCK, axis).take(range(size[axis]), axis)
+    reach = STEEPEST * step * np.sqrt(3) * (BLOCK + 1) / 2
+    index = np.argwhere(np.abs(values) < reach)
+    for part in np.array_split(index, max(1, len(index) // 50_000)):
+        points = np.stack([axis[i] for axis, i in zip(axes, part.T, strict=True)], axis=1)
+        values[tuple(part.T)] = field(points)
+    values[values == 0] = 1e-12
+    return values
+
+
+def subdivided(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Each triangle as four, cut at the middles of its edges."""
+    edges = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1)  # edge i of a face: from its corner i to the next
+    unique, middle = np.unique(np.sort(edges, axis=-1).reshape(-1, 2), axis=0, return_inverse=True)
+    middle = len(vertices) + middle.reshape(-1, 3)
+    a, b, c = faces.T
+    ab, bc, ca = middle.T
+    parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+    return np.concatenate([vertices, vertices[unique].mean(1)]), np.concatenate([np.stack(p, axis=1) for p in parts])
 
 
 def project(vertices: np.ndarray, field: Field, step: float, rounds: int = 3) -> np.ndarray:
@@ -125,7 +161,7 @@ def project(vertices: np.ndarray, field: Field, step: float, rounds: int = 3) ->
     h = 1e-4 * step
     for _ in range(rounds):
         value = field(vertices)
-        gradient = np.stack([field(vertices + h * e) - field(vertices - h * e) for e in np.eye(3)], axis=1) / (2 * h)
+        gradient = np.stack([field(vertices + h * e) - value for e in np.eye(3)], axis=1) / h
         length = np.maximum(np.linalg.norm(gradient, axis=1), 1e-9)
         move = np.clip(value / length, -step / 2, step / 2)
         vertices = vertices - (move / length)[:, None] * gradient

@@ -143,7 +143,7 @@ def mushroom() -> Mesh:
 
 def cactus() -> Mesh:
     def ribs(p: np.ndarray) -> np.ndarray:
-        return 0.018 * np.cos(10 * np.arctan2(p[:, 1], p[:, 0]))
+        return 0.018 * np.cos(10 * np.arctan2(p[:, 1], p[:, 0])) * np.minimum(np.hypot(p[:, 0], p[:, 1]) / 0.15, 1)
 
     trunk = capsule((0, 0, -0.7), (0, 0, 0.7), 0.2, 0.19)
     arms = [polyline(np.array([[0.1, 0, -0.1], [0.45, 0, 0], [0.5, 0, 0.4]]), [0.1, 0.11, 0.1]),
@@ -226,7 +226,7 @@ def teapot() -> Mesh:
         torus((-0.55, 0, 0), 0.3, 0.055, axis=1),
         k=0.02,
     )
-    spout = capsule((0.78, 0, 0.24), (1.05, 0, 0.44), 0.04, 0.06)
+    spout = capsule((0.84, 0, 0.3), (1.08, 0, 0.44), 0.03, 0.045)
     return surface_nets(cut(body, spout, k=0.008), [1.05, 0.62, 0.62], 96)
 
 
@@ -263,10 +263,11 @@ def banana() -> Mesh:
 
 def nautilus() -> Mesh:
     """Shell: a tube that widens along a flat spiral, its coils blended."""
-    a = np.linspace(0, 4.4 * np.pi, 56)
+    a = np.linspace(0, 4.4 * np.pi, 48)
     growth = np.exp(0.115 * (a - a[-1]))
     coil = np.stack([0.62 * growth * np.cos(a), 0.06 * a / a[-1], 0.62 * growth * np.sin(a)], axis=1)
-    mouth = sphere(coil[-1] + [0.03, 0, 0.1], 0.24)
+    ahead = (coil[-1] - coil[-2]) / np.linalg.norm(coil[-1] - coil[-2])
+    mouth = sphere(coil[-1] + 0.24 * ahead, 0.25)
     return surface_nets(cut(polyline(coil, 0.36 * growth, k=0.006), mouth, k=0.01), [1.05, 0.5, 1.05], 64)
 
 
@@ -303,7 +304,7 @@ def urchin() -> Mesh:
     z = 1 - (2 * np.arange(n) + 1) / n
     a = np.pi * (3 - np.sqrt(5)) * np.arange(n)
     tips = np.stack([np.sqrt(1 - z**2) * np.cos(a), np.sqrt(1 - z**2) * np.sin(a), z], axis=1)
-    return star_shaped(lambda d: 0.6 + 0.35 * np.exp((np.max(d @ tips.T, axis=1) - 1) / 0.012), 256)
+    return star_shaped(lambda d: 0.6 + 0.35 * np.exp((np.max(d @ tips.T, axis=1) - 1) / 0.012), 352)
 
 
 def blob(seed: int, balls: int = 9) -> Mesh:
@@ -327,7 +328,7 @@ def wrinkled(seed: int = 8) -> Mesh:
     """Ball with ridges and grooves, like a walnut or a brain."""
     noise = waves(seed, 7, 11)
     return star_shaped(
-        lambda d: 0.8 - 0.08 * np.exp(-(noise(d) ** 2) / 0.12) - 0.14 * np.exp(-(d[:, 1] ** 2) / 0.004), 256
+        lambda d: 0.8 - 0.08 * np.exp(-(noise(d) ** 2) / 0.12) - 0.14 * np.exp(-(d[:, 1] ** 2) / 0.004), 352
     )
 
 
@@ -385,8 +386,8 @@ def coil() -> Mesh:
 
 def chain() -> Mesh:
     """Three links that hang in each other."""
-    links = [torus((x, 0, 0), 0.26, 0.075, axis=axis) for x, axis in ((-0.42, 2), (0, 1), (0.42, 2))]
-    return surface_nets(union(*links), [0.85, 0.42, 0.42], 90)
+    links = [torus((x, 0, 0), 0.26, 0.075, axis=axis) for x, axis in ((-0.33, 2), (0, 1), (0.33, 2))]
+    return surface_nets(union(*links), [0.75, 0.42, 0.42], 90)
 
 
 def holes(count: int) -> Mesh:

@@ -5,7 +5,7 @@ import numpy as np
 from pnu.data import cad, organic
 from pnu.io import Mesh
 
-VERSION = 1  # of the shapes: a file of patches made from others is not used
+VERSION = 2  # of the shapes: a file of patches made from others is not used
 KINDS = {"organic": organic.SHAPES, "cad": cad.SHAPES}
 
 
