@@ -126,6 +126,18 @@ def test_switches(network: type[PNU]) -> None:
     assert set(both.outputs(patch)) == {"prediction"}
 
 
+@pytest.mark.parametrize("network", [PNU, PNUPaper])
+@pytest.mark.parametrize(("switched_off", "given"), [("", 6), ("predict_normals", 3), ("input_normals", 3)])
+def test_residual_adds_to_the_input(network: type[PNU], switched_off: str, given: int) -> None:
+    patch = patches(2, 64)
+    options = {switched_off: False} if switched_off else {}
+    plain, added = network(**options).eval(), network(**options, residual=True).eval()
+    added.load_state_dict(plain.state_dict())
+    difference = (added(patch) - plain(patch)).view(2, 4, 64, -1)
+    torch.testing.assert_close(difference[..., :given], patch[:, None, :, :given].expand(-1, 4, -1, -1))
+    torch.testing.assert_close(difference[..., given:], torch.zeros_like(difference[..., given:]))
+
+
 def test_new_points_stand_in_blocks() -> None:
     """Without local features a permutation of the input permutes each block of n outputs."""
     network = PNU(local_features=False).eval()

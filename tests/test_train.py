@@ -112,6 +112,7 @@ def test_config_is_resolved_and_plain(finished: Path) -> None:
     assert config["model"] == {
         "_target_": "pnu.models.pnu.PNU",
         **{"ratio": 4, "input_normals": True, "predict_normals": True, "local_features": True, "global_features": True},
+        "residual": False,
     }
 
 

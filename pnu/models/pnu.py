@@ -53,6 +53,7 @@ class PNU(nn.Module):
         predict_normals: predict normals beside points; without, the output has 3 columns.
         local_features: PointNet++ features of each point (256).
         global_features: PointNet features of the patch (512).
+        residual: predict what is added to the input point and normal; ours. Neither paper nor code has it.
 
     Source: Sharma et al., "Point Cloud Upsampling and Normal Estimation using Deep Learning for Robust Surface
     Reconstruction", and its released code, which takes PointNet++ for the local features of Fig. 1.
@@ -68,12 +69,13 @@ class PNU(nn.Module):
         predict_normals: bool = True,
         local_features: bool = True,
         global_features: bool = True,
+        residual: bool = False,
     ) -> None:
         super().__init__()
         if ratio not in (2, 4, 8, 16):
             raise ValueError(f"model.ratio: expected 2, 4, 8 or 16, got {ratio!r}")
         self.ratio, self.patch_size = ratio, 1024
-        self.predicts_normals = predict_normals
+        self.predicts_normals, self.residual = predict_normals, residual
         self.channels = 6 if input_normals else 3
         self.local_features = self.local(self.channels) if local_features else None
         self.global_features = MLP((self.channels, 32, 64, 64, 128, 256, 512)) if global_features else None
@@ -107,11 +109,15 @@ class PNU(nn.Module):
         points = self.regression(features)
         # the released order: all first halves, then all second ones, the last expansion outermost
         steps = len(self.expansions)
-        return (
+        predicted = (
             points.unflatten(1, (n, *[2] * steps))
             .permute(0, *range(steps + 1, 0, -1), -1)
             .reshape(batch, -1, points.shape[-1])
         )
+        if not self.residual:
+            return predicted
+        given = x[..., : predicted.shape[-1]].repeat(1, self.ratio, 1)  # row i + b n is copy b of point i
+        return predicted + F.pad(given, (0, predicted.shape[-1] - given.shape[-1]))
 
     def outputs(self, patch: Tensor) -> dict[str, Tensor]:
         """What the loss may read: here the prediction alone."""

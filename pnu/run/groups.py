@@ -63,6 +63,7 @@ class Model:
     predict_normals: bool = doc("predict normals beside points")
     local_features: bool = doc("features of each point's neighbourhood")
     global_features: bool = doc("features of the whole patch")
+    residual: bool = doc("predict what is added to the input point and normal; ours, not the paper's")
     neighbours: int = doc("input points that a seed looks at (model=surface, as the following)")
     reach: int = doc("rank of the farthest of them; beyond the 16 nearest they are thinned out")
     width: int = doc("of the network")
