@@ -164,5 +164,9 @@ class UpsamplingModule(pl.LightningModule):
             raise ValueError(
                 "scheduler: needs to know the number of steps; give trainer.max_epochs or trainer.max_steps"
             )
-        scheduler = self.scheduler(optimizer, **{name: int(steps) for name in horizon})
+        lengths: dict[str, Any] = {name: int(steps) for name in horizon}
+        try:
+            scheduler = self.scheduler(optimizer, **lengths)
+        except ZeroDivisionError:  # OneCycleLR with one step of warm-up, the first: then without
+            scheduler = self.scheduler(optimizer, **lengths, pct_start=0.5 / int(steps))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}

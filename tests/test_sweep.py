@@ -18,8 +18,6 @@ from pnu.run.sweep import arguments, check_job, label_of, sweep_name
 from pnu.train import Train, main
 from tests.test_train import patch_file  # noqa: F401  a fixture
 
-pytestmark = pytest.mark.slow  # real sweeps in processes of their own: minutes on two cores
-
 ABLATIONS = sorted(path.stem for path in (config_folder() / "ablation").glob("*.yaml"))
 SETTINGS = sorted(
     path.relative_to(config_folder() / "setting").as_posix().removesuffix(".yaml")
@@ -178,6 +176,7 @@ def test_one_device_is_fine() -> None:
 # --- start, again, go on ---
 
 
+@pytest.mark.slow
 def test_a_sweep_started_again_skips_what_has_finished(
     patch_file: Path,  # noqa: F811
     tmp_path: Path,
@@ -214,8 +213,8 @@ def test_killed_in_the_middle_and_started_again(
     line = [*small(patch_file), "ablation=loss_terms", "scale=small", "setting=default,loss_terms/cd", "seed=0"]
     line += ["~data.patches"]  # of shapes, not of a file
     # longer than `small`, with a checkpoint at each step, so that it can be killed within the second job
-    line += ["data.batch_size=2", "data.augmentation=null", "trainer.max_steps=12", "trainer.max_epochs=-1"]
-    line += ["callbacks.checkpoints.every_n_steps=1", "trainer.val_check_interval=5", "sweep=s"]
+    line += ["data.batch_size=2", "data.augmentation=null", "trainer.max_steps=8", "trainer.max_epochs=-1"]
+    line += ["callbacks.checkpoints.every_n_steps=1", "trainer.val_check_interval=4", "sweep=s"]
     folder = tmp_path / "outputs" / "sweeps" / "s"
     process = subprocess.Popen([sys.executable, "-m", "pnu.train", *line], stdout=subprocess.DEVNULL, cwd=tmp_path)
     deadline = time.monotonic() + 200
@@ -246,6 +245,7 @@ def test_killed_in_the_middle_and_started_again(
     assert "have not finished" not in text
 
 
+@pytest.mark.slow
 def test_a_job_that_runs_is_left_alone(
     patch_file: Path,  # noqa: F811
     tmp_path: Path,
@@ -285,7 +285,7 @@ def test_a_failing_job_is_told_at_once_and_the_others_go_on(
     assert stopped.value.code == 1
     captured = capsys.readouterr()
     assert re.search(r"^job 0 \(optimizer.lr=1e\+?30\) failed: .*(finite|NaN|inf)", captured.err, re.M)
-    assert "Traceback" not in captured.err
+    assert captured.err.count("\n") == 1  # Hydra does not tell it again
     assert "(1 failed, 1 finished)" in captured.out
     states = [record["status"] for record in records(tmp_path / "outputs/sweeps/s").values()]
     assert sorted(states) == ["failed", "finished"]
@@ -326,6 +326,7 @@ def test_launchers_give_the_same_bits(patch_file: Path, tmp_path: Path) -> None:
     assert found["basic"] == found["joblib"] == found["submitit"]
 
 
+@pytest.mark.slow
 def test_a_search_goes_on_from_its_storage(
     patch_file: Path,  # noqa: F811
     tmp_path: Path,
@@ -361,6 +362,7 @@ def test_a_search_goes_on_from_its_storage(
     assert 1 <= len(front) <= 2
 
 
+@pytest.mark.slow
 def test_a_search_needs_its_metric(
     patch_file: Path,  # noqa: F811
     tmp_path: Path,

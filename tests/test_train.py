@@ -283,6 +283,16 @@ def test_a_run_without_checkpoint_starts_again(train: Train) -> None:
     assert same(weights(run), final)
 
 
+def test_a_run_of_an_older_version_goes_on(train: Train) -> None:
+    run = train("trainer.max_epochs=1")
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    del config["objective"], config["threads"]  # keys that came later
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    resume(run, "trainer.max_epochs=2")
+    assert read(run / "checkpoints/last.ckpt")["global_step"] == 8
+    assert yaml.safe_load((run / "config.yaml").read_text())["objective"] is None
+
+
 def refused(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> str:
     with pytest.raises(SystemExit) as stopped:
         main(arguments)
@@ -399,6 +409,13 @@ def test_every_choice_trains_a_step(train: Train, choice: str) -> None:
     run = train(choice, "trainer.max_steps=1", "trainer.max_epochs=1", "data.batch_size=2")
     assert record(run)["status"] == "finished"
     assert read(run / "checkpoints/last.ckpt")["global_step"] == 1
+
+
+def test_onecycle_without_warm_up(train: Train) -> None:
+    """Two steps of which half are warm-up: torch alone divides by the length of the warm-up, 1 - 1."""
+    run = train("scheduler=onecycle", "scheduler.pct_start=0.5", "trainer.max_steps=2", "trainer.max_epochs=1")
+    first, last = (event.value for event in events(run).Scalars("train/lr"))
+    assert 1e-3 > first > last
 
 
 def test_early_stopping_stops(train: Train) -> None:

@@ -86,6 +86,8 @@ def restored(run: RunFolder, config: dict[str, Any], overrides: Sequence[str], s
         saved = check(OmegaConf.load(run.config), schema)
     except (OmegaConfBaseException, YAMLError, AttributeError, TypeError) as error:
         raise ValueError(f"{run.config}: expected the config of a run, found {' '.join(str(error).split())}") from None
+    for key in config.keys() - saved.keys():  # of a later version than the run's
+        OmegaConf.update(saved, key, config[key], force_add=True)
     known = set(shlex.split(str(run.read_record().get("command", ""))))
     values = flatten(config)
     for override in overrides:

@@ -14,8 +14,9 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stderr
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO, cast
 
 from pnu.io import read_json
 from pnu.run.config import one_line, parse, variations
@@ -146,7 +147,8 @@ def run(start: Callable[[], None], folder: Path) -> None:
     """Start a sweep; at its end tell how its jobs ended. Exit code 1 if any failed."""
     began = time.time() - 1
     try:
-        start()
+        with redirect_stderr(cast(TextIO, WithoutEcho(sys.stderr))):
+            start()
     except SystemExit:
         print(closing(folder), flush=True)
         raise
@@ -154,6 +156,21 @@ def run(start: Callable[[], None], folder: Path) -> None:
     ended = [run for run in runs(folder) if run.record_path.stat().st_mtime > began]
     if any(run.read_record().get("status") != "finished" for run in ended):  # Optuna goes on without them
         sys.exit(1)
+
+
+class WithoutEcho:
+    """A stream without what Hydra writes at the end of a sweep about a failed job, which was told when it failed."""
+
+    ECHO = ("Error executing job with overrides:", "error: ", "\nSet the environment variable HYDRA_FULL_ERROR")
+
+    def __init__(self, stream: TextIO) -> None:
+        self.stream = stream
+
+    def write(self, text: str) -> int:
+        return len(text) if text.startswith(self.ECHO) else self.stream.write(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
 
 
 def runs(sweep: Path) -> list[RunFolder]:
