@@ -1,6 +1,8 @@
-"""Searches and samplings at training size against plain torch versions with full distance matrices."""
+"""Searches and samplings at training size against plain torch with full distance matrices, SciPy and Open3D."""
 
+import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bench.timing import Row, compare
@@ -32,41 +34,67 @@ def plain_ball_query(query: Tensor, target: Tensor, radius: float, k: int) -> Te
     return torch.where(found < n, found, found[..., :1] % n)
 
 
-def main() -> list[Row]:
-    """One row an operation; goal: ten times faster on two threads."""
+def open3d_knn(points: np.ndarray, k: int) -> None:
+    """Open3D's tensor search, one cloud after the other."""
+    import open3d.core as o3c
+
+    for cloud in points:
+        tensor = o3c.Tensor(cloud)
+        search = o3c.nns.NearestNeighborSearch(tensor)
+        search.knn_index()
+        search.knn_search(tensor, k)
+
+
+def scipy_knn(points: np.ndarray, k: int) -> None:
+    for cloud in points:
+        cKDTree(cloud).query(cloud, k=k, workers=torch.get_num_threads())
+
+
+def open3d_farthest_points(points: np.ndarray, m: int) -> None:
+    import open3d
+
+    for cloud in points:
+        open3d.t.geometry.PointCloud(open3d.core.Tensor(cloud)).farthest_point_down_sample(m)
+
+
+def rows() -> list[Row]:
+    """One row an operation; goal on two threads: ten times faster than plain torch."""
     points = torch.rand(CLOUDS, POINTS, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     centers = points[:, :1024].contiguous()
+    arrays = points.numpy()
     return [
         compare(
             f"16 nearest, {CLOUDS} x {POINTS}",
             {
-                "tree": lambda: knn(points, points, 16),
-                "full matrix, topk": lambda: full_matrix(points, points).topk(16, largest=False),
+                "pnu": lambda: knn(points, points, 16),
+                "plain torch: full matrix, topk": lambda: full_matrix(points, points).topk(16, largest=False),
+                "SciPy cKDTree, cloud by cloud": lambda: scipy_knn(arrays, 16),
+                "Open3D, cloud by cloud": lambda: open3d_knn(arrays, 16),
             },
         ),
         compare(
             f"nearest, {CLOUDS} x {POINTS}",
-            {"tree": lambda: nearest(points, points), "full matrix, min": lambda: full_matrix(points, points).min(-1)},
+            {
+                "pnu": lambda: nearest(points, points),
+                "plain torch: full matrix, min": lambda: full_matrix(points, points).min(-1),
+                "SciPy cKDTree, cloud by cloud": lambda: scipy_knn(arrays, 1),
+                "Open3D, cloud by cloud": lambda: open3d_knn(arrays, 1),
+            },
         ),
         compare(
             f"farthest points, {CLOUDS} x {POINTS} -> 1024",
             {
-                "buckets": lambda: farthest_points(points, 1024),
-                "full matrix, loop": lambda: plain_farthest_points(points, 1024),
+                "pnu": lambda: farthest_points(points, 1024),
+                "plain torch: full matrix, loop": lambda: plain_farthest_points(points, 1024),
+                "Open3D, cloud by cloud": lambda: open3d_farthest_points(arrays, 1024),
             },
             rounds=3,
         ),
         compare(
             f"ball query r = 0.1, {CLOUDS} x 1024 in 1024",
             {
-                "tree": lambda: ball_query(centers, centers, 0.1, 32),
-                "full matrix, sort": lambda: plain_ball_query(centers, centers, 0.1, 32),
+                "pnu": lambda: ball_query(centers, centers, 0.1, 32),
+                "plain torch: full matrix, sort": lambda: plain_ball_query(centers, centers, 0.1, 32),
             },
         ),
     ]
-
-
-if __name__ == "__main__":
-    torch.set_num_threads(2)
-    for row in main():
-        print(row)

@@ -1,20 +1,21 @@
-"""A training step of the paper's size against a plain port: `python -m bench.step [threads]`.
+"""A training step of the paper's size against a plain port: `python -m bench step`.
 
 20 patches of 1024 -> 4096 points: forward, loss, backward, Adam. Beside the ratios: where our step spends its time, and
 the limit, the step's floating-point operations over the measured rate of a large matrix product.
 """
 
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import lru_cache, partial
+from typing import NamedTuple
 from unittest.mock import patch
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.profiler import ProfilerActivity, profile
+from torch.profiler import ProfilerActivity
+from torch.profiler import profile as torch_profile
 from torch.utils.flop_counter import FlopCounterMode
 
 import pnu.losses.compound
@@ -29,6 +30,7 @@ from pnu.ops import patches, surface
 from pnu.ops.normalize import unit_sphere_frame
 
 CLOUDS, POINTS, RATIO = 20, 1024, 4
+SIZE = f"{CLOUDS} x {POINTS} -> {POINTS * RATIO}"
 SEARCHES = {
     "farthest points": (pnu.models.layers, "farthest_points"),
     "balls": (pnu.models.layers, "ball_query"),
@@ -79,32 +81,58 @@ def loss_of(loss: nn.Module, prediction: Tensor) -> None:
     loss(prediction, data()[1])["loss"].backward()
 
 
-def rows(rounds: int = 3) -> list[Row]:
-    """The step, and the loss alone with its gradient, against the plain port."""
+def step_rows(rounds: int = 3) -> list[Row]:
+    """The step against the plain port."""
     ours, plain = trainings()
+    return [compare(f"training step, {SIZE}", {"pnu": ours, "plain torch port": plain}, rounds=rounds)]
+
+
+def loss_rows(rounds: int = 3) -> list[Row]:
+    """The loss alone, with its gradient, against the plain port."""
     _, target = data()
-    prediction = (target + 0.01 * torch.randn(target.shape)).requires_grad_()
-    losses = {"pnu": partial(loss_of, CompoundLoss(), prediction), "plain": partial(loss_of, PlainLoss(), prediction)}
-    size = f"{CLOUDS} x {POINTS} -> {POINTS * RATIO}"
-    return [
-        compare(f"training step, {size}", {"pnu": ours, "plain": plain}, rounds=rounds),
-        compare(f"compound loss and gradient, {CLOUDS} x {POINTS * RATIO}", losses, rounds=rounds),
-    ]
+    noise = torch.randn(target.shape, generator=torch.Generator().manual_seed(0))
+    prediction = (target + 0.01 * noise).requires_grad_()
+    losses = {"pnu": CompoundLoss(), "plain torch: full matrices": PlainLoss()}
+    runs = {name: partial(loss_of, loss, prediction) for name, loss in losses.items()}
+    return [compare(f"compound loss and gradient, {CLOUDS} x {POINTS * RATIO}", runs, rounds=rounds)]
 
 
-def limit() -> tuple[float, float]:
-    """Floating-point operations of our step (GFLOP), and the rate of a large matrix product (GFLOP/s)."""
+class Profile(NamedTuple):
+    """One step on one thread: where its time goes in percent, and the limit beside it."""
+
+    seconds: float
+    gflop: float
+    gflop_per_second: float  # of a large matrix product
+    percent: dict[str, float]
+
+    @property
+    def limit(self) -> float:
+        """Seconds that the matrix products alone would take."""
+        return self.gflop / self.gflop_per_second
+
+    def lines(self) -> list[str]:
+        head = (
+            f"A step of ours on one thread: {self.seconds:.2f} s. Its {self.gflop:.0f} GFLOP at the "
+            f"{self.gflop_per_second:.0f} GFLOP/s of a large matrix product take {self.limit:.2f} s: "
+            f"{self.seconds / self.limit:.1f} x the limit."
+        )
+        return [head, "", "| part | % |", "|---|---|", *(f"| {k} | {v:.1f} |" for k, v in self.percent.items())]
+
+
+def profile(rounds: int = 3) -> Profile:
+    """Our step in turn with a large matrix product, both on one thread."""
     ours, _ = trainings()
-    with one_thread(), FlopCounterMode(display=False) as counter:
-        ours()
     a, b = torch.randn(CLOUDS * POINTS, 512), torch.randn(512, 512)
-    row = compare("product", {"torch": lambda: a @ b}, rounds=11)
-    return counter.get_total_flops() / 1e9, 2 * a.numel() * 512 / row.seconds["torch"] / 1e9
+    with one_thread():
+        with FlopCounterMode(display=False) as counter:
+            ours()
+        row = compare("step", {"step": ours, "product": lambda: [a @ b for _ in range(10)]}, rounds=rounds)
+        rate = 10 * 2 * a.numel() * 512 / row.seconds["product"] / 1e9
+        return Profile(row.seconds["step"], counter.get_total_flops() / 1e9, rate, shares(ours))
 
 
-def shares() -> dict[str, float]:
-    """Where our step spends its time on one thread, in percent."""
-    ours, _ = trainings()
+def shares(ours: Callable[[], Tensor]) -> dict[str, float]:
+    """Where our step spends its time, in percent."""
     taken = dict.fromkeys(SEARCHES, 0.0)
 
     def timed(name: str, function: Callable[..., object], *args: object, **options: object) -> object:
@@ -114,23 +142,32 @@ def shares() -> dict[str, float]:
         finally:
             taken[name] += time.perf_counter() - start
 
-    with one_thread():
+    with torch_profile(activities=[ProfilerActivity.CPU]) as profiled:
         ours()
-        with profile(activities=[ProfilerActivity.CPU]) as profiled:
-            ours()
-        with ExitStack() as stack:
-            for name, (module, function) in SEARCHES.items():
-                stack.enter_context(patch.object(module, function, partial(timed, name, getattr(module, function))))
-            start = time.perf_counter()
-            ours()
-            total = time.perf_counter() - start
+    with ExitStack() as stack:
+        for name, (module, function) in SEARCHES.items():
+            stack.enter_context(patch.object(module, function, partial(timed, name, getattr(module, function))))
+        start = time.perf_counter()
+        ours()
+        total = time.perf_counter() - start
     searches = {name: 100 * seconds / total for name, seconds in taken.items()}
-    events = [event for event in profiled.key_averages() if event.key.startswith("aten::")]
-    everything = sum(event.self_cpu_time_total for event in profiled.key_averages())
-    products = sum(e.self_cpu_time_total for e in events if e.key in ("aten::mm", "aten::addmm", "aten::addmm_"))
-    rest = 100 - sum(searches.values())
-    products = 100 * products / everything
-    return {"matrix products": products, **searches, "element by element, gathers, Python": rest - products}
+    events = profiled.key_averages()
+    everything = sum(event.self_cpu_time_total for event in events)
+
+    def share(*names: str) -> float:
+        return 100 * sum(e.self_cpu_time_total for e in events if e.key.removeprefix("aten::") in names) / everything
+
+    parts = {
+        "matrix products": share("mm", "addmm", "addmm_"),
+        **searches,
+        "sums over rows": share("mv", "addmv", "addmv_"),
+        "batch norm and ReLU, forward and back": share("addcmul", "relu_", "threshold_backward", "mul_", "sub"),
+        "gathers and their gradients": share(
+            "index_select", "index", "embedding_bag", "_embedding_bag", "scatter_add_", "index_put_", "cat"
+        ),
+        "maxima over neighbourhoods": share("amax", "eq"),
+    }
+    return {**parts, "everything else": 100 - sum(parts.values())}
 
 
 @contextmanager
@@ -141,20 +178,3 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
-
-
-def main() -> None:
-    torch.set_num_threads(int(sys.argv[1]) if len(sys.argv) > 1 else 2)
-    measured = rows()
-    for row in measured:
-        print(row)
-    gflop, rate = limit()
-    ratio = measured[0].seconds["pnu"] / (gflop / rate)
-    print(f"limit of the step: {gflop:.0f} GFLOP at {rate:.0f} GFLOP/s = {gflop / rate:.2f} s; ours {ratio:.1f} x that")
-    print("our step on one thread, in percent:")
-    for name, share in shares().items():
-        print(f"{share:6.1f}  {name}")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,96 @@
+"""Upsampling 5000 -> 20000 points against the paper's procedure done naively, in a warm process and as a command."""
+
+import subprocess
+import sys
+import tempfile
+from functools import partial
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from bench.ops import full_matrix, plain_farthest_points
+from bench.plain import PlainPNU
+from bench.scale import wavy_sphere
+from bench.timing import Row, compare
+from pnu import weights
+from pnu.inference import upsample
+from pnu.io import write_cloud
+from pnu.models.pnu import PNU
+from pnu.models.released import from_released
+
+POINTS, RATIO, PATCH = 5000, 4, 1024
+
+
+@torch.no_grad()
+def naive(network: torch.nn.Module, cloud: Tensor) -> Tensor:
+    """The paper's section Inference word by word: full matrices, one patch after the other. cloud (n, 6)."""
+    points = cloud[:, :3]
+    count = round(RATIO * len(cloud) / PATCH)
+    centers = plain_farthest_points(points[None], count)[0]
+    idx = full_matrix(points[None, centers], points[None])[0].topk(PATCH, largest=False).indices
+    predicted = []
+    for patch in cloud[idx]:
+        middle = patch[:, :3].mean(0)
+        size = (patch[:, :3] - middle).norm(dim=1).max()
+        dense = network(torch.cat([(patch[:, :3] - middle) / size, patch[:, 3:]], 1)[None])[0]
+        predicted.append(torch.cat([dense[:, :3] * size + middle, dense[:, 3:]], 1))
+    everything = torch.cat(predicted)
+    return everything[plain_loop(everything[:, :3], RATIO * len(cloud))]
+
+
+def plain_loop(points: Tensor, m: int) -> Tensor:
+    """Farthest points of one cloud without its matrix, which has no room for 80000 points."""
+    reach = torch.full((len(points),), torch.inf)
+    chosen = torch.zeros(m, dtype=torch.int64)
+    for i in range(1, m):
+        torch.minimum(reach, (points - points[chosen[i - 1]]).square().sum(1), out=reach)
+        chosen[i] = reach.argmax()
+    return chosen
+
+
+def rows() -> list[Row]:
+    torch.manual_seed(0)
+    plain, ours = PlainPNU().eval(), PNU().eval()
+    ours.load_state_dict(from_released(plain.state_dict()))
+    cloud = wavy_sphere(POINTS)
+    points, normals = cloud[:, :3], cloud[:, 3:]
+    tensor = torch.from_numpy(cloud).float()
+    size = f"{POINTS} -> {RATIO * POINTS}"
+    warm = [
+        compare(
+            f"upsample {size}, network pnu, warm",
+            {
+                "pnu": partial(upsample, points, normals, model=ours),
+                "the paper's procedure, naively": partial(naive, plain, tensor),
+            },
+            rounds=3,
+        ),
+        compare(
+            f"upsample {size}, surface, warm",
+            {
+                "pnu": partial(upsample, points, normals, model="surface"),
+                "the paper's procedure, naively": partial(naive, plain, tensor),
+            },
+            rounds=3,
+        ),
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder) / "cloud.ply", Path(folder) / "dense.ply"
+        write_cloud(source, points, normals)
+        command = [sys.executable, "-m", "pnu.upsample", f"input={source}", f"output={target}", "quiet=true"]
+        alone = [sys.executable, "-c", "import torch"]
+        run = partial(subprocess.run, check=True, capture_output=True)
+        cold = [
+            compare(
+                f"whole command {size}, {name}",
+                {
+                    "python -m pnu.upsample": partial(run, [*command, f"run={name}"]),
+                    "import torch": partial(run, alone),
+                },
+                rounds=3,
+            )
+            for name in ("surface", "surface_estimated")
+            if name in weights.names()
+        ]
+    return warm + cold
