@@ -82,9 +82,9 @@ def test_pugeo_maps_2d_samples_to_the_tangent_plane() -> None:
 
 
 def test_repulsion_by_hand() -> None:
-    """Three points in a row, one neighbour each: distances 0.1, 0.1 and 0.2."""
+    """Three points in a row, one neighbour each: distances 0.1, 0.1 and 0.2; h is meant for 4096 points."""
     points = torch.tensor([[[0.0, 0, 0], [0.1, 0, 0], [0.3, 0, 0]]], dtype=torch.float64)
-    terms = RepulsionLoss(w_repulsion=0.5, h=0.02, k=1)(points, points)
+    terms = RepulsionLoss(w_repulsion=0.5, h=0.02 * 3 / 4096, k=1)(points, points)
     expected = -(2 * 0.1 * math.exp(-0.01 / 0.02) + 0.2 * math.exp(-0.04 / 0.02)) / 3
     assert float(terms["repulsion"]) == pytest.approx(expected)
     assert float(terms["cd"]) == 0
@@ -124,6 +124,15 @@ def test_edge_terms_by_hand() -> None:
     assert float(terms["edge"]) == pytest.approx(float(true[true < 0.5].square().mean()))
     assert float(terms["edge_distance"].detach()) == pytest.approx(float((true.clamp(max=0.5) - 0.05).square().mean()))
     assert float(terms["surface"]) == pytest.approx(0.01**2, rel=0.05)
+
+
+def test_repulsion_of_edge_aware_loss_by_hand() -> None:
+    """A square of side 0.1 with h = 0.12 for four points: both neighbours are within, the diagonal is not."""
+    corners = torch.tensor([[[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0]]], dtype=torch.float64)
+    cloud = torch.cat([corners, torch.tensor([0.0, 0, 1]).expand(1, 4, 3)], -1)
+    extra = {"edges": torch.full((1, 1, 3), math.nan).double(), "edge_distance": torch.ones(1, 4).double()}
+    terms = EdgeAwareLoss(h=0.12 / 32, k=3)(corners, cloud, extra)
+    assert float(terms["repulsion"]) == pytest.approx(2 / 3 * (0.12**2 - 0.1**2))
 
 
 def test_patch_without_edges_has_no_edge_term() -> None:

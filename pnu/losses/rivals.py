@@ -13,6 +13,8 @@ from pnu.losses.compound import chamfer, emd, search
 from pnu.ops.grouping import gather
 from pnu.ops.nearest import knn, nearest
 
+DENSE = 4096  # target points for which the papers give reaches; with fewer the reach grows as their spacing does
+
 
 def total(terms: dict[str, Tensor], weights: Mapping[str, float]) -> dict[str, Tensor]:
     """The terms and "loss", their weighted sum."""
@@ -28,7 +30,8 @@ class RepulsionLoss(nn.Module):
     Args:
         point_term: "chamfer" or "emd", the paper's reconstruction loss (earth mover's distance, slower).
         w_repulsion: the paper's alpha.
-        h: squared reach of the repulsion, in squared units of the patch.
+        h: squared reach of the repulsion in a patch of 4096 target points, in squared units of the patch; for n it is
+            h 4096 / n.
         k: neighbours that repel a point.
     """
 
@@ -50,7 +53,8 @@ class RepulsionLoss(nn.Module):
         else:
             terms["emd"] = emd(prediction, target)
         dist_sq = (points[:, :, None] - gather(points, matches.neighbors)).square().sum(-1)
-        terms["repulsion"] = -(dist_sq.clamp_min(1e-12).sqrt() * torch.exp(-dist_sq / self.h)).mean()
+        h = self.h * DENSE / target.shape[1]
+        terms["repulsion"] = -(dist_sq.clamp_min(1e-12).sqrt() * torch.exp(-dist_sq / h)).mean()
         return total(terms, self.weights)
 
 
@@ -60,7 +64,8 @@ class EdgeAwareLoss(nn.Module):
 
     surface: squared distance of new points to the true surface; the dense target stands for the mesh: distance to the
     tangent plane of the nearest target point, plus what lies beyond the target's spacing within that plane.
-    repulsion: mean over k neighbours at distance r of max(0, h^2 - r^2).
+    repulsion: mean over k neighbours at distance r of max(0, h^2 - r^2), with h for 4096 target points; for n it is
+    h sqrt(4096 / n).
     edge: mean squared true distance to the nearest edge over the points whose regressed distance is below `near`.
     edge_distance: mean squared difference of regressed and true distance, both truncated to [0, reach].
 
@@ -101,7 +106,7 @@ class EdgeAwareLoss(nn.Module):
         on_edge = (regressed.detach() < self.near) & (true.detach() < self.reach)
         terms = {
             "surface": surface_distance_sq(points, target, matches.nearest_target).mean(),
-            "repulsion": (self.h**2 - dist_sq).relu().mean(),
+            "repulsion": (self.h**2 * DENSE / target.shape[1] - dist_sq).relu().mean(),
             "edge": (true.square() * on_edge).sum() / on_edge.sum().clamp_min(1),
             "edge_distance": (regressed.clamp(0, self.reach) - true.detach().clamp(0, self.reach)).square().mean(),
         }

@@ -96,7 +96,7 @@ class Loss:
     unit_normals: bool = doc("normalise predicted normals before the loss; the released code does not")
     near_ties: str = doc("of the nearest prediction: released (its rounding decides) or exact")
     w_repulsion: float = doc("weight of repulsion (PU-Net, EC-Net)")
-    h: float = doc("reach of repulsion in the unit sphere: squared for PU-Net, plain for EC-Net")
+    h: float = doc("reach of repulsion for 4096 target points in the unit sphere: squared for PU-Net, plain for EC-Net")
     w_edge: float = doc("weight of the distance of edge points to the edges (EC-Net)")
     w_edge_distance: float = doc("weight of the regressed distance to the nearest edge (EC-Net)")
     near: float = doc("regressed distance below which a point belongs to an edge (EC-Net)")
