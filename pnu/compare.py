@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 class Compare:
     """Evaluate several methods on the same clouds; write a page with tables, surfaces and 3D views. Trains nothing."""
 
-    methods: list[str] = doc("run folders, and apss, poisson, midpoint; NAME:FOLDER gives a run another name")
+    methods: list[str] = doc(
+        "run folders, folders of a sweep, and apss, poisson, midpoint; NAME:FOLDER gives a run another name"
+    )
     data: Data = doc("synthetic, or meshes with data.root=FOLDER: meshes, or prepared pairs in clouds/ and truth/")
     part: str | None = doc("of the shapes: train, val, test, all; null: test of the procedural ones, all of a folder")
     shapes: list[str] | None = doc("names of the shapes to take; null: all of the part")
@@ -101,7 +103,7 @@ def upsamplers(cfg: Any) -> dict[str, "Upsampler"]:
     from pnu import checkpoint, classical, evaluation, weights
 
     found: dict[str, Upsampler] = {}
-    for method in cfg.methods:
+    for method in [one for given in cfg.methods for one in runs_of_sweep(given) or [given]]:
         name, _, folder = method.rpartition(":")
         if folder in classical.METHODS:
             model, name = classical.method(folder), name or folder
@@ -124,6 +126,16 @@ def upsamplers(cfg: Any) -> dict[str, "Upsampler"]:
             seed=cfg.seed,
         )
     return found
+
+
+def runs_of_sweep(method: str) -> list[str]:
+    """NAME:FOLDER of each finished run of a sweep; none if `method` is no sweep's folder. The name has no hash."""
+    from pnu.run.sweep import runs
+
+    if not Path(method).is_dir() or Path(method, "config.yaml").exists():
+        return []
+    finished = [run for run in runs(Path(method)) if run.read_record().get("status") == "finished"]
+    return [f"{run.path.name.rpartition('_')[0]}:{run.path}" for run in finished]
 
 
 def check(cfg: Any) -> None:

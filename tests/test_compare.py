@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,11 @@ import torch
 from PIL import Image
 
 from pnu import checkpoint, comparison
-from pnu.compare import main
+from pnu.compare import main, runs_of_sweep
 from pnu.comparison.shapes import error_limit, points_for, rebuild, view
 from pnu.comparison.tables import tables
 from pnu.evaluation import Case, Truth
-from pnu.io import read_json, write_mesh
+from pnu.io import read_json, write_json, write_mesh
 from pnu.models.pnu import PNU
 from pnu.ops.surface import sample_poisson_disk
 from tests.test_page import CHROMIUM, browse
@@ -122,6 +123,22 @@ def test_a_network_of_a_run_folder(place: Path) -> None:
     rows = {row["method"]: row for row in read_json(place / "network" / "metrics.json")["rows"]}
     assert rows["first"]["points_out"] == 600
     assert rows["first"]["chamfer_sq"] == rows["ours"]["chamfer_sq"] > rows["floor"]["chamfer_sq"]
+
+
+def test_the_finished_runs_of_a_sweep(place: Path) -> None:
+    (place / "sweep").mkdir()
+    for name in ("wide_0123abcd", "no_cd_4567abcd", "broken_89ab"):
+        shutil.copytree(place / "runs" / "first", place / "sweep" / name)
+    write_json(place / "sweep" / "broken_89ab" / "run.json", {"status": "failed"})
+    assert runs_of_sweep(str(place / "sweep")) == [
+        f"no_cd:{place}/sweep/no_cd_4567abcd",
+        f"wide:{place}/sweep/wide_0123abcd",
+    ]
+    assert runs_of_sweep("apss") == runs_of_sweep(f"{place}/runs/first") == []
+    data = ["data=meshes", f"data.root={place}/meshes", "kinds=[sparse]", "surfaces=[]", "shapes=[ball]"]
+    main([f"methods=[{place}/sweep,apss]", *data, *SMALL, f"output={place}/swept"])
+    rows = read_json(place / "swept" / "metrics.json")["rows"]
+    assert [row["method"] for row in rows] == ["no_cd", "wide", "apss", "floor", "input"]
 
 
 def case() -> Case:
