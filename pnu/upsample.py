@@ -48,7 +48,9 @@ def upsample(cfg: Any) -> None:
     say(f"input:  {cfg.input}, {len(cloud.points)} points, {origin}")
 
     from pnu import inference
+    from pnu.ops.survey import survey
 
+    say(f"        {survey(cloud.points, cloud.normals)}")
     run = inference.source(cfg.run, cloud.normals)
     say(
         f"run:    {run}{'' if cfg.run else ' (the newest finished one)' if Path(run).is_dir() else ' (comes with pnu)'}"

@@ -1,7 +1,12 @@
 """Attributes at new points: exact where they must be, and never from the other side of a sheet."""
 
-import numpy as np
+import subprocess
+import sys
 
+import numpy as np
+import pytest
+
+from pnu.io import read_cloud, write_cloud
 from pnu.ops.attributes import carry
 
 RNG = np.random.default_rng(0)
@@ -49,3 +54,23 @@ def test_point_that_faces_no_neighbour_takes_the_nearest() -> None:
     sparse, dense = plane(10), plane(5, up=-1.0)
     nearest = np.linalg.norm(dense[:, None, :3] - sparse[:, :3], axis=2).argmin(1)
     np.testing.assert_array_equal(carry(dense, sparse, np.arange(10)), nearest)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
+def test_colours_of_a_thin_sheet_reach_the_file(tmp_path, suffix: str) -> None:
+    """Two sides a third of a spacing apart, red and blue, densified by the command itself."""
+    sides = np.repeat([1.0, -1.0], 400)
+    cloud = np.vstack([plane(400, 0.008), plane(400, -0.008, -1.0)])
+    colors = np.where(sides[:, None] > 0, [[200, 0, 0]], [[0, 0, 100]]).astype(np.uint8)
+    write_cloud(tmp_path / "in.ply", cloud[:, :3], cloud[:, 3:], {"colors": colors, "side": sides})
+    command = [sys.executable, "-m", "pnu.upsample", "input=in.ply", f"output=out{suffix}", "run=surface", "quiet=true"]
+    subprocess.run(command, cwd=tmp_path, check=True, timeout=120)
+    dense = read_cloud(tmp_path / f"out{suffix}")
+    assert dense.normals is not None
+    assert dense.attributes["colors"].dtype == np.uint8
+    up = dense.normals[:, 2] > 0
+    np.testing.assert_array_equal(
+        dense.attributes["colors"][:, :3], np.where(up[:, None], [[200, 0, 0]], [[0, 0, 100]])
+    )
+    np.testing.assert_allclose(dense.attributes["side"], np.where(up, 1.0, -1.0), atol=1e-5)
+    assert (np.sign(dense.points[:, 2]) == np.where(up, 1, -1)).mean() > 0.95

@@ -52,9 +52,10 @@ def test_newest_run_and_report(place: Path) -> None:
     assert np.abs(dense.points.mean(0) - 1e6).max() < 100
     lines = done.stdout.splitlines()
     assert lines[0] == "input:  cloud.ply, 200 points, with normals"
-    assert lines[1] == "run:    outputs/2026-01-02/03-04-05_small (the newest finished one)"
-    assert lines[2].startswith("output: dense.xyz, 700 points with unit normals, ")
-    assert lines[3] == "next:   python -m pnu.reconstruct input=dense.xyz output=mesh.ply"
+    assert lines[1].startswith("        spacing ")
+    assert lines[2] == "run:    outputs/2026-01-02/03-04-05_small (the newest finished one)"
+    assert lines[3].startswith("output: dense.xyz, 700 points with unit normals, ")
+    assert lines[4] == "next:   python -m pnu.reconstruct input=dense.xyz output=mesh.ply"
     assert "farthest points" in done.stderr
 
 
