@@ -14,8 +14,7 @@ from omegaconf import OmegaConf
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch.utils.tensorboard.summary import hparams
 
-from pnu.checkpoint import read
-from pnu.io import atomic_path
+from pnu.checkpoint import read, write
 from pnu.ops.colors import normal_colors
 from pnu.pictures import figure, look_at, render_cloud, save_png
 from pnu.run import RunFolder, build
@@ -25,8 +24,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     """Writes checkpoints that appear whole or not at all; reads tensors and plain types only."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        with atomic_path(path) as temporary:
-            torch.save(checkpoint, temporary)
+        write(path, checkpoint)
 
     def load_checkpoint(self, path: Any, map_location: Any = "cpu", weights_only: bool | None = True) -> dict[str, Any]:
         return read(path)

@@ -8,6 +8,7 @@ Checkpoints are read with `weights_only=True`: tensors and plain types, never co
 """
 
 import datetime
+import io
 import json
 import shutil
 import uuid
@@ -23,7 +24,7 @@ import yaml
 from torch import Tensor, nn
 
 from pnu import models, weights
-from pnu.io import write_json
+from pnu.io import atomic_path, write_json
 
 PREFIX = "model."
 
@@ -65,7 +66,7 @@ def run_config(folder: Path) -> dict[str, Any]:
         raise ValueError(f"run={folder}: expected a run folder with config.yaml, found none")
     try:
         config = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{path}: is not YAML ({' '.join(str(error).split())}); restore or remove it") from error
     if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
         raise ValueError(f"{path}: expected a group 'model' with the network's _target_ and arguments, found none")
@@ -101,6 +102,14 @@ def read(path: str | PathLike[str]) -> dict[str, Any]:
     return content
 
 
+def write(path: str | PathLike[str], content: Mapping[str, Any]) -> None:
+    """Write a checkpoint, whole or not at all."""
+    buffer = io.BytesIO()  # torch's own writing of files takes a full disk for a success
+    torch.save(dict(content), buffer)
+    with atomic_path(Path(path)) as temporary:
+        temporary.write_bytes(buffer.getbuffer())
+
+
 def fill(network: nn.Module, state: Mapping[str, Tensor], source: str | PathLike[str]) -> None:
     """Load a state into a network; ValueError with the first difference if it is another network's."""
     own = {name: tuple(value.shape) for name, value in network.state_dict().items()}
@@ -127,7 +136,7 @@ def save(folder: Path, network: nn.Module, config: Mapping[str, Any], record: Ma
         (temporary / "checkpoints").mkdir(parents=True)
         (temporary / "config.yaml").write_text(yaml.safe_dump({"model": dict(config)}), encoding="utf-8")
         state = {PREFIX + name: value for name, value in network.state_dict().items()}
-        torch.save({"state_dict": state}, temporary / "checkpoints" / "best.ckpt")
+        write(temporary / "checkpoints" / "best.ckpt", {"state_dict": state})
         write_json(temporary / "run.json", {"status": "finished", "ratio": network.ratio, **record})
         temporary.rename(folder)
     except OSError as error:

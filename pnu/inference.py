@@ -167,6 +167,9 @@ def _prepare(cloud: Cloud, progress: Progress) -> tuple[Tensor, Frame]:
         raise ValueError(f"points: holds {len(kept)} different points; at least {MINIMUM} are needed")
     frame = unit_sphere_frame(torch.from_numpy(points[kept])[None])
     unit = frame.to_unit(torch.from_numpy(points[kept])[None])
+    extent = torch.linalg.svdvals(unit[0] - unit[0].mean(0))
+    if extent[1] < 1e-9 * extent[0]:
+        raise ValueError(f"points: all {len(points)} points lie on a line; expected points on a surface")
     if normals is None:
         progress("normals", 0, 1)
         directions = estimate_normals(unit)[0]

@@ -14,6 +14,7 @@ import torch
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 
+from pnu.checkpoint import write
 from pnu.metrics import CloudMetrics
 
 Batch = Mapping[str, Any]
@@ -129,7 +130,7 @@ class UpsamplingModule(pl.LightningModule):
             return
         path = Path(self.trainer.default_root_dir) / f"nonfinite_step{self.global_step}_rank{self.global_rank}.pt"
         content = {"step": self.global_step, "terms": {k: float(v) for k, v in values.items()}, "batch": dict(batch)}
-        torch.save(content, path)
+        write(path, content)
         first = next((name for name in broken if name != "loss"), broken[0])
         raise NonFinite(
             f"step {self.global_step}: {first} is {float(values[first])}; the batch is in {path};"

@@ -424,6 +424,13 @@ def test_early_stopping_stops(train: Train) -> None:
     assert read(run / "checkpoints/last.ckpt")["global_step"] < 36
 
 
+def test_deterministic_mode_gives_the_same_bits(train: Train) -> None:
+    runs = [train("trainer.deterministic=true", "trainer.max_steps=2") for _ in range(2)]
+    one, two = (read(run / "checkpoints/last.ckpt")["state_dict"] for run in runs)
+    assert all(torch.equal(one[name], two[name]) for name in one)
+    torch.use_deterministic_algorithms(False)
+
+
 def test_without_validation_and_test(train: Train) -> None:
     run = train("trainer.max_steps=1", "trainer.limit_val_batches=0", "trainer.limit_test_batches=0", "quiet=false")
     assert record(run)["status"] == "finished"

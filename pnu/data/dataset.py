@@ -17,6 +17,7 @@ from pnu.ops.grouping import gather
 from pnu.ops.normalize import unit_sphere_frame
 from pnu.ops.sampling import nonuniform_points, poisson_disk_points, random_points
 
+DATASETS = ("poisson_4096", "montecarlo_1024", "edges")
 Downsampling = Literal["nonuniform", "random", "poisson", "given"]
 
 
@@ -66,20 +67,27 @@ class PatchDataset(Dataset[dict[str, Any]]):
     def file(self) -> dict[str, h5py.Dataset]:
         """The file's datasets by name."""
         if self.opened is None or self.opened[0] != os.getpid():  # a handle shared across a fork reads wrong data
-            self.opened = os.getpid(), dict(h5py.File(self.path, "r"))
+            file = h5py.File(self.path, "r")
+            self.opened = os.getpid(), {name: file[name] for name in DATASETS if name in file}
         return self.opened[1]
+
+    def read(self, name: str, row: int) -> Tensor:
+        """A row of a dataset, (1, n, 3 or 6) float32; `ValueError` where the file is damaged there."""
+        try:
+            return torch.from_numpy(self.file()[name][row])[None].float()
+        except (OSError, RuntimeError, KeyError):
+            raise ValueError(f"{self.path}: patch {row} of {name} cannot be read; the file is damaged") from None
 
     def __getitem__(self, key: int | tuple[int, int]) -> dict[str, Any]:
         epoch, i = key if isinstance(key, tuple) else (0, key)
         row = self.rows[i]
         generator = sample_generator(self.seed, epoch, row)
-        file = self.file()
-        target = torch.from_numpy(file["poisson_4096"][row])[None].float()
+        target = self.read("poisson_4096", row)
         if self.options.target_points < target.shape[1]:
             target = neighborhood(target, self.options.target_points, generator)
         clouds = {"input": self.downsampled(target, row, generator), "target": target}
-        if "edges" in file:
-            clouds["edges"] = torch.from_numpy(file["edges"][row])[None].float()
+        if "edges" in self.file():
+            clouds["edges"] = self.read("edges", row)
         frame = unit_sphere_frame(clouds["input"])
         clouds = {name: frame.to_unit(cloud) for name, cloud in clouds.items()}
         if self.augmentation is not None:
@@ -90,7 +98,7 @@ class PatchDataset(Dataset[dict[str, Any]]):
     def downsampled(self, target: Tensor, row: int, generator: torch.Generator) -> Tensor:
         m, kind = self.options.input_points, self.options.downsampling
         if kind == "given":
-            given = torch.from_numpy(self.file()["montecarlo_1024"][row])[None].float()
+            given = self.read("montecarlo_1024", row)
             return gather(given, random_points(given, m, generator=generator))
         points = target[..., :3]
         if kind == "nonuniform":

@@ -2,8 +2,10 @@
 
 import json
 import multiprocessing
-from collections.abc import Callable, Iterable, Mapping
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -85,19 +87,38 @@ def build(
     names = sorted(shapes)
     counts = [patches // len(names) + (i < patches % len(names)) for i in range(len(names))]
     jobs = [(name, shapes[name], count, seed) for name, count in zip(names, counts, strict=True)]
-    text = h5py.string_dtype()
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with atomic_path(path) as temporary:
+        lay_out(temporary, [job[0] for job, count in zip(jobs, counts, strict=True) for _ in range(count)], parameters)
+        with h5py.File(temporary, "r+") as file:
+            row = 0
+            results: Iterable[Any] = results_of(jobs, processes)
+            for _, made in progress(results, len(jobs)) if progress else results:
+                rows = slice(row, row + len(made.clouds))
+                file["poisson_4096"][rows], file["edges"][rows] = made.clouds, made.edges
+                row = rows.stop
+
+
+def lay_out(path: Path, names: Sequence[str], parameters: Mapping[str, Any] | None) -> None:
+    """A patch file that lacks only the numbers. Their space is taken first: on a full disk HDF5 crashes."""
+    reserve(path, len(names) * 4 * (6 * PATCH_POINTS + 3 * EDGE_POINTS) + 2**20)
+    whole = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    whole.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    whole.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    with h5py.File(path, "w") as file:
         file.attrs["parameters"] = json.dumps(dict(parameters or {}), sort_keys=True)
-        clouds = file.create_dataset("poisson_4096", (patches, PATCH_POINTS, 6), "f4", chunks=(1, PATCH_POINTS, 6))
-        edges = file.create_dataset("edges", (patches, EDGE_POINTS, 3), "f4", chunks=(1, EDGE_POINTS, 3))
-        name_of = file.create_dataset("name", (patches,), text)
-        row = 0
-        results: Iterable[Any] = results_of(jobs, processes)
-        for name, made in progress(results, len(jobs)) if progress else results:
-            rows = slice(row, row + len(made.clouds))
-            clouds[rows], edges[rows], name_of[rows] = made.clouds, made.edges, name
-            row = rows.stop
+        file["name"] = np.array(names, h5py.string_dtype())
+        for name, shape in (("poisson_4096", (PATCH_POINTS, 6)), ("edges", (EDGE_POINTS, 3))):
+            space = h5py.h5s.create_simple((len(names), *shape))
+            h5py.h5d.create(file.id, name.encode(), h5py.h5t.IEEE_F32LE, space, whole)
+    reserve(path, path.stat().st_size)
+
+
+def reserve(path: Path, size: int) -> None:
+    """Take space on the disk for a file; `OSError` where there is none."""
+    with path.open("ab") as handle:
+        if hasattr(os, "posix_fallocate"):  # not on macOS
+            os.posix_fallocate(handle.fileno(), 0, size)
 
 
 def results_of(jobs: list[tuple[str, Callable[[], Mesh], int, int]], processes: int) -> Iterable[tuple[str, Patches]]:
@@ -138,10 +159,17 @@ def check(path: str | Path) -> Contents:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"{path}: no such file; expected an HDF5 file of patches as data/README.md describes")
+    with opened(path) as file:
+        return contents_of(path, file)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[h5py.File]:
+    """A patch file, to read; `ValueError` where its bytes are no HDF5."""
     try:
         with h5py.File(path, "r") as file:
-            return contents_of(path, file)
-    except (OSError, RuntimeError):  # what h5py raises where bytes are missing or wrong
+            yield file
+    except (OSError, RuntimeError, KeyError):  # what h5py raises where bytes are missing or wrong
         raise ValueError(f"{path}: expected an HDF5 file of patches, found something else or a damaged file") from None
 
 
@@ -216,7 +244,7 @@ def names_of(path: Path, file: h5py.File, patches: int) -> list[str] | None:
 def describe(path: str | Path) -> dict[str, Any]:
     """Figures of a patch file: its datasets, shapes, spacing and extent of patches, range of coordinates, normals."""
     contents = check(path)
-    with h5py.File(path, "r") as file:
+    with opened(Path(path)) as file:
         clouds = file["poisson_4096"]
         sample = clouds[:: -(-len(clouds) // 32)].astype(float)
         points, normals = sample[..., :3], sample[..., 3:]

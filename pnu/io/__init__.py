@@ -1,6 +1,6 @@
 """Files: the only room that knows formats. What is read is checked; what is written appears whole or not at all."""
 
-from pnu.io.atomic import atomic_path, check_writable, read_json, write_json
+from pnu.io.atomic import atomic_path, check_writable, read_json, remove_leftovers, write_json
 from pnu.io.cloud import CLOUD_SUFFIXES, Cloud, check_cloud, check_output, keeps_attributes, read_cloud, write_cloud
 from pnu.io.mesh import MESH_SUFFIXES, Mesh, read_mesh, write_mesh
 
@@ -17,6 +17,7 @@ __all__ = [
     "read_cloud",
     "read_json",
     "read_mesh",
+    "remove_leftovers",
     "write_cloud",
     "write_json",
     "write_mesh",

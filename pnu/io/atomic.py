@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -27,10 +28,18 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     except OSError as error:
         if error.filename not in (None, str(temporary), temporary):
             raise
-        reason = error.strerror or str(error)
+        told = re.search(r"error message = '([^']+)'", str(error))  # by HDF5, among much else
+        reason = error.strerror or (told[1] if told else str(error))
         raise ValueError(f"{path}: cannot be written ({reason}); free space or choose another folder") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_leftovers(folder: str | Path) -> None:
+    """Remove what `atomic_path` left below a folder when its process was killed. Nothing else may write there."""
+    for path in Path(folder).rglob(".*"):
+        if re.fullmatch(r"\..+\.[0-9a-f]{12}(\.\w+)?", path.name) and path.is_file():
+            path.unlink()
 
 
 def check_writable(path: str | Path) -> None:

@@ -71,6 +71,7 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
                 if goes_on:
                     own = [o for o in parsed.overrides if o.startswith("hydra.")]
                     hydra_config = compose([*next(variations(overrides)), *own], True).hydra
+                    Path(hydra_config.sweep.dir).mkdir(parents=True, exist_ok=True)
                     arguments += search.arguments(hydra_config)
         except (ValueError, OSError) as error:
             if full_errors():

@@ -143,4 +143,6 @@ def in_multirun() -> bool:
 
 def one_line(error: BaseException) -> str:
     """An exception's message on one line."""
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}"
     return " ".join(str(error).split()) or type(error).__name__

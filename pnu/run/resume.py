@@ -5,6 +5,7 @@ import shlex
 from collections.abc import Sequence
 from typing import Any
 
+from pnu.io import remove_leftovers
 from pnu.run import sweep
 from pnu.run.config import flatten, in_multirun
 from pnu.run.folder import RunFolder, is_main_process
@@ -56,6 +57,7 @@ def open_run(cfg: Any, schema: type) -> tuple[RunFolder, dict[str, Any]]:
         config = restored(run, config, overrides, schema)
         if is_main_process():
             run.lock = sweep.locked(run.path)
+            remove_leftovers(run.path)
             run.write_config(config)
         return run, config
     if not is_main_process():
@@ -84,7 +86,7 @@ def restored(run: RunFolder, config: dict[str, Any], overrides: Sequence[str], s
 
     try:
         saved = check(OmegaConf.load(run.config), schema)
-    except (OmegaConfBaseException, YAMLError, AttributeError, TypeError) as error:
+    except (OmegaConfBaseException, YAMLError, AttributeError, TypeError, RecursionError) as error:
         raise ValueError(f"{run.config}: expected the config of a run, found {' '.join(str(error).split())}") from None
     for key in config.keys() - saved.keys():  # of a later version than the run's
         OmegaConf.update(saved, key, config[key], force_add=True)

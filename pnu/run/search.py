@@ -1,7 +1,6 @@
 """A search by Optuna that goes on from its storage."""
 
 import warnings
-from pathlib import Path
 from typing import Any
 
 
@@ -19,7 +18,6 @@ def arguments(hydra: Any) -> list[str]:
     storage = sweeper.get("storage")
     if "Optuna" not in str(sweeper.get("_target_")) or not storage:
         return []
-    Path(hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
     import optuna
     from optuna.trial import TrialState
 

@@ -18,7 +18,7 @@ from contextlib import redirect_stderr
 from pathlib import Path
 from typing import Any, TextIO, cast
 
-from pnu.io import read_json
+from pnu.io import read_json, remove_leftovers
 from pnu.run.config import one_line, parse, variations
 from pnu.run.folder import RunFolder, config_hash
 
@@ -86,6 +86,7 @@ def job_folder(config: Mapping[str, Any]) -> RunFolder:
     folder = found[0] if found else RunFolder(sweep / f"{label}_{digest[:8]}")
     folder.path.mkdir(parents=True, exist_ok=True)
     folder.lock = locked(folder.path)
+    remove_leftovers(folder.path)
     record = folder.read_record()
     folder.skip = record.get("status") == "finished"
     if not folder.skip and not folder.last.exists():  # nothing to go on from

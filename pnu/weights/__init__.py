@@ -37,7 +37,7 @@ def read(path: str | PathLike[str]) -> tuple[dict[str, Any], dict[str, Tensor]]:
         with safe_open(path, "pt") as file:
             config = json.loads((file.metadata() or {}).get("model", "null"))
             state = {name: file.get_tensor(name) for name in sorted(file.keys())}
-    except (SafetensorError, OSError, json.JSONDecodeError) as error:
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: expected weights as safetensors, found {' '.join(str(error).split())}") from error
     if not isinstance(config, dict):
         raise ValueError(f"{path}: expected weights written by pnu.export, found no network's config in their metadata")
@@ -46,9 +46,10 @@ def read(path: str | PathLike[str]) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
 def write(path: str | PathLike[str], config: Mapping[str, Any], state: Mapping[str, Tensor]) -> None:
     """Write a network's config and state, atomically."""
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     from pnu.io import atomic_path
 
     with atomic_path(Path(path)) as temporary:
-        save_file({k: v.contiguous() for k, v in state.items()}, temporary, {"model": json.dumps(dict(config))})
+        content = save({k: v.contiguous() for k, v in state.items()}, {"model": json.dumps(dict(config))})
+        temporary.write_bytes(content)

@@ -1,0 +1,189 @@
+"""What must hold for `pnu.upsample` whatever the cloud, with the weights that ship.
+
+Tolerances are in spacings, the median distance of an input point to its nearest other one. Which of the equally good
+candidates are kept may differ after a rotation or another rounding; where the surface lies may not.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+import pnu
+from pnu import evaluation
+from pnu.data import shapes
+from pnu.ops.surface import closest_points, sample_area
+
+Array = np.ndarray
+MESH = shapes.make("mug")
+CLOUD = sample_area(MESH, 250, np.random.default_rng(0))
+POINTS, NORMALS = CLOUD[:, :3], CLOUD[:, 3:]
+few = settings(max_examples=4, deadline=None, derandomize=True, database=None)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def upsample(points: Array, normals: Array | None, ratio: float = 2, **options: int) -> Array:
+    return pnu.upsample(points, normals, ratio=ratio, model="surface", **options)
+
+
+def spacing(points: Array) -> float:
+    return float(np.median(cKDTree(points).query(points, 2)[0][:, 1]))
+
+
+def apart(a: Array, b: Array) -> float:
+    """The greatest distance of a point of one cloud to the other."""
+    return max(cKDTree(a[:, :3]).query(b[:, :3])[0].max(), cKDTree(b[:, :3]).query(a[:, :3])[0].max())
+
+
+def error(dense: Array) -> float:
+    """Mean distance to the true surface."""
+    return float(closest_points(MESH, dense[:, :3])[1].mean())
+
+
+@pytest.fixture(scope="module", params=["given", "estimated"])
+def normals(request: pytest.FixtureRequest) -> Array | None:
+    return NORMALS if request.param == "given" else None
+
+
+@pytest.fixture(scope="module")
+def dense(normals: Array | None) -> Array:
+    return upsample(POINTS, normals)
+
+
+def turned(normals: Array | None, rotation: Rotation) -> Array | None:
+    return None if normals is None else rotation.apply(normals)
+
+
+def same_surface(dense: Array, other: Array) -> None:
+    assert apart(dense, other) < 2.5 * spacing(POINTS)
+    assert error(other) == pytest.approx(error(dense), rel=0.25)
+    nearest = cKDTree(dense[:, :3]).query(other[:, :3])[1]
+    cosine = (dense[nearest, 3:] * other[:, 3:]).sum(1)
+    assert np.median(cosine) > np.cos(np.radians(8))
+    assert (cosine < 0).mean() < 0.03
+
+
+def test_order(dense: Array, normals: Array | None) -> None:
+    order = np.random.default_rng(1).permutation(len(POINTS))
+    shuffled = upsample(POINTS[order], None if normals is None else normals[order])
+    np.testing.assert_array_equal(shuffled, dense)
+
+
+def test_duplicates(dense: Array, normals: Array | None) -> None:
+    more = np.r_[0 : len(POINTS), 0:50]
+    repeated = upsample(POINTS[more], None if normals is None else normals[more], ratio=len(dense) / len(more))
+    np.testing.assert_array_equal(repeated, dense)
+
+
+def test_rigid_motion(dense: Array, normals: Array | None) -> None:
+    rotation = Rotation.random(rng=np.random.default_rng(3))
+    moved = upsample(rotation.apply(POINTS) + [3, -2, 9], turned(normals, rotation))
+    back = np.hstack([rotation.inv().apply(moved[:, :3] - [3, -2, 9]), rotation.inv().apply(moved[:, 3:])])
+    same_surface(dense, back)
+
+
+@few
+@given(st.floats(-6, 6))
+def test_scale(exponent: float) -> None:
+    scale = 10**exponent
+    scaled = upsample(POINTS * scale, NORMALS)
+    scaled[:, :3] /= scale
+    same_surface(upsample(POINTS, NORMALS), scaled)
+
+
+@pytest.mark.parametrize("scale", [2.0**-20, 2.0**20])
+def test_scale_by_a_power_of_two(dense: Array, normals: Array | None, scale: float) -> None:
+    scaled = upsample(POINTS * scale, normals)
+    np.testing.assert_array_equal(scaled, dense * np.repeat([scale, 1], 3))
+
+
+def test_millimetres_at_map_coordinates(dense: Array, normals: Array | None) -> None:
+    """An object of two metres, given in metres, thousands of kilometres from the origin."""
+    place = np.array([4_123_456.789, 5_312_345.678, 123.4])
+    moved = upsample(POINTS + place, normals)
+    same_surface(dense, moved - np.r_[place, 0, 0, 0])
+    assert len(np.unique(np.round(moved[:, 0] % 1, 6))) > len(moved) / 2, "less than float64 somewhere on the way"
+
+
+@pytest.mark.parametrize("options", [{"batch_size": 33}, {"batch_size": 200}])
+def test_batch_size(dense: Array, normals: Array | None, options: dict[str, int]) -> None:
+    same_surface(dense, upsample(POINTS, normals, **options))
+
+
+def test_threads(dense: Array, normals: Array | None) -> None:
+    torch.set_num_threads(2)
+    try:
+        same_surface(dense, upsample(POINTS, normals))
+    finally:
+        torch.set_num_threads(1)
+
+
+@pytest.mark.parametrize("far", [100.0, 1e6])
+def test_two_distant_pieces(normals: Array | None, far: float) -> None:
+    both = np.concatenate([POINTS, POINTS + [far, 0, 0]])
+    dense = upsample(both, None if normals is None else np.tile(normals, (2, 1)))
+    assert cKDTree(both).query(dense[:, :3])[0].max() < 5 * spacing(POINTS), "points between the pieces"
+    assert (dense[:, 0] > far / 2).mean() == pytest.approx(0.5, abs=0.05)
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_plane(given: bool) -> None:
+    flat = np.random.default_rng(0).random((250, 3)) * [1, 1, 0]
+    rotation = Rotation.from_euler("xyz", [0.3, 1, 2])
+    dense = upsample(rotation.apply(flat), rotation.apply([[0, 0, 1.0]] * 250) if given else None)
+    points, directions = rotation.inv().apply(dense[:, :3]), rotation.inv().apply(dense[:, 3:])
+    assert np.abs(points[:, 2]).max() < 0.5 * spacing(flat)
+    assert np.abs(directions[:, 2]).min() > 0.99
+    assert np.ptp(np.sign(directions[:, 2])) == 0, "one side"
+    assert -4 * spacing(flat) < points[:, :2].min() < points[:, :2].max() < 1 + 4 * spacing(flat)
+
+
+@pytest.mark.parametrize("given", [True, False])
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_a_line_is_no_surface(given: bool, scale: float) -> None:
+    line = scale * np.linspace(0, 1, 50)[:, None] * [1, 2, 3.0] + 7 * scale
+    with pytest.raises(ValueError, match="points: all 50 points lie on a line; expected points on a surface"):
+        upsample(line, np.tile([3, 0, -1.0], (50, 1)) if given else None)
+
+
+@few
+@given(st.integers(0, 2**32), st.integers(16, 90), st.sampled_from([1.0, 1.7, 4.0]), st.booleans())
+def test_any_cloud_gives_unit_normals_near_its_points(seed: int, n: int, ratio: float, given: bool) -> None:
+    """Also points in no order at all, some of them far away or repeated."""
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(n, 3)) * 10 ** rng.uniform(-3, 3, size=3) * 10 ** rng.uniform(0, 2, size=(n, 1))
+    directions = rng.normal(size=(n, 3)) if given else None
+    dense = upsample(points, directions, ratio)
+    assert dense.shape == (round(ratio * n), 6)
+    np.testing.assert_allclose(np.linalg.norm(dense[:, 3:], axis=1), 1, atol=1e-6)
+    size = np.ptp(points, axis=0).max()
+    assert np.isfinite(dense).all()
+    assert np.abs(dense[:, :3] - points.mean(0)).max() < 3 * size
+
+
+def measured(names: list[str]) -> dict[str, dict[str, float]]:
+    """Metrics of the clouds of two meshes, taken in this order."""
+    meshes = {name: (lambda name=name: shapes.make(name)) for name in names}
+    drawn = evaluation.mesh_cases(meshes, ["random"], points=200, truth_points=800, warn=lambda text: None)
+    return {case.truth.shape: evaluation.measure(np.hstack([case.points, case.normals]), case.truth) for case in drawn}
+
+
+def test_metrics_depend_neither_on_threads_nor_on_the_order_of_files() -> None:
+    one = measured(["mug", "nut"])
+    torch.set_num_threads(3)
+    try:
+        assert measured(["nut", "mug"]) == one
+    finally:
+        torch.set_num_threads(1)
