@@ -11,11 +11,13 @@ from typing import Any
 
 import lightning.pytorch as pl
 import torch
+from lightning.pytorch.plugins.layer_sync import TorchSyncBatchNorm
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 
 from pnu.checkpoint import write
 from pnu.metrics import CloudMetrics
+from pnu.models.norm import synchronize
 
 Batch = Mapping[str, Any]
 
@@ -54,6 +56,16 @@ def keep_threads() -> None:
     which torch takes instead, and another number of threads rounds differently."""
     if os.environ.get("OMP_NUM_THREADS", "").isdigit():
         torch.set_num_threads(max(1, int(os.environ["OMP_NUM_THREADS"])))
+
+
+class SynchronizedNorms(TorchSyncBatchNorm):
+    """trainer.sync_batchnorm=true, on the CPU as well."""
+
+    def apply(self, model: nn.Module) -> nn.Module:
+        return synchronize(model)
+
+    def revert(self, model: nn.Module) -> nn.Module:
+        return synchronize(model, False)
 
 
 class NonFinite(ValueError):
@@ -112,7 +124,8 @@ class UpsamplingModule(pl.LightningModule):
         if self.trainer.precision != "16-mixed":  # whose scaler expects infinite gradients and skips their step
             self.check_finite({"gradient": norm}, self.batch)
         self.batch = {}
-        values = {f"train/{name}": float(value) for name, value in self.terms.items()}
+        means = self.trainer.strategy.reduce(torch.stack(list(self.terms.values())), reduce_op="mean")  # over processes
+        values = {f"train/{name}": value for name, value in zip(self.terms, means.tolist(), strict=True)}
         values |= {"train/gradient_norm": float(norm), "train/lr": float(optimizer.param_groups[0]["lr"])}
         self.log_dict(values, logger=False)
         # written at once, before the checkpoint of this step: a training that is killed after it loses no step's values

@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from pnu.checkpoint import read
 
@@ -167,10 +168,24 @@ def test_interrupted_by_hand(tmp_path: Path, small: list[str]) -> None:
     assert json.loads((tmp_path / "run/run.json").read_text())["error"] == "interrupted"
 
 
+def curve(run: Path) -> list[float]:
+    """The loss at every step, from TensorBoard."""
+    return [event.value for event in EventAccumulator(str(run / "tensorboard")).Reload().Scalars("train/loss")]
+
+
 @pytest.mark.slow
-def test_two_processes_train_one_model(tmp_path: Path, small: list[str]) -> None:
-    done = train(tmp_path, *small, "trainer.devices=2", "trainer.strategy=ddp", "trainer.max_epochs=2", "quiet=true")
-    assert done.returncode == 0, done.stderr
-    (run,) = tmp_path.glob("outputs/*/*")
-    assert json.loads((run / "run.json").read_text())["status"] == "finished"
-    assert read(run / "checkpoints/last.ckpt")["global_step"] == 4  # 10 patches in batches of 2 in two processes
+def test_two_processes_train_as_one(tmp_path: Path, small: list[str]) -> None:
+    """Half the batch in each of two processes: the same steps, to rounding."""
+    line = [*small, "trainer.max_epochs=3", "trainer.precision=64-true", "quiet=true"]
+    for name, options in {
+        "one": ["data.batch_size=4"],
+        "two": ["trainer.devices=2", "trainer.strategy=ddp", "trainer.sync_batchnorm=true"],
+    }.items():
+        done = train(tmp_path, *line, *options, f"run={tmp_path / name}")
+        assert done.returncode == 0, done.stderr
+        assert json.loads((tmp_path / name / "run.json").read_text())["status"] == "finished"
+    one, two = curve(tmp_path / "one"), curve(tmp_path / "two")
+    assert len(one) == 6  # 10 patches, two batches of 4 in an epoch
+    assert one[-1] < 0.9 * one[0]
+    np.testing.assert_allclose(two, one, rtol=1e-4)
+    np.testing.assert_allclose(two[0], one[0], rtol=1e-6)

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from pnu.models import chunks, layers
 from pnu.models.layers import MLP
 from pnu.models.neighborhoods import Groups, distinct, single, whole
+from pnu.models.norm import synchronize
 
 
 @pytest.fixture(autouse=True)
@@ -114,13 +115,13 @@ def test_distinct_neighbours() -> None:
     assert groups.multiplicity.tolist() == [3, 2, 1, 1, 1, 1]
 
 
-def _synchronised(rank: int, folder: str, x: Tensor) -> None:
+def _synchronised(rank: int, folder: str, x: Tensor, plainly: bool) -> None:
     """One of two processes, which hold an uneven part each, with synchronised batch norm."""
     store = torch.distributed.FileStore(str(Path(folder) / "store"), 2)
     torch.distributed.init_process_group("gloo", store=store, rank=rank, world_size=2, timeout=timedelta(seconds=60))
-    network = nn.SyncBatchNorm.convert_sync_batchnorm(mlp(7, 16, 12))
+    network = synchronize(mlp(7, 16, 12))
     part = x[:100] if rank == 0 else x[100:]
-    output = network(part)
+    output = nn.Sequential.forward(network, part) if plainly else network(part)
     output.square().sum().backward()
     gradients = [p.grad for name, p in network.named_parameters() if "linear.bias" not in name]
     for gradient in gradients:
@@ -129,10 +130,11 @@ def _synchronised(rank: int, folder: str, x: Tensor) -> None:
     torch.distributed.destroy_process_group()
 
 
-def test_synchronised_batch_norm(tmp_path: Path) -> None:
-    """Two processes compute what one does with all rows."""
+@pytest.mark.parametrize("plainly", [False, True])
+def test_synchronised_batch_norm(plainly: bool, tmp_path: Path) -> None:
+    """Two processes compute what one does with all rows, chunk by chunk or layer by layer."""
     x = torch.randn(150, 7, dtype=torch.float64)
-    torch.multiprocessing.spawn(_synchronised, (str(tmp_path), x), nprocs=2)
+    torch.multiprocessing.spawn(_synchronised, (str(tmp_path), x, plainly), nprocs=2)
     network = mlp(7, 16, 12)
     output = network(x)
     output.square().sum().backward()

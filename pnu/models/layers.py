@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from pnu.models import stack
 from pnu.models.neighborhoods import Groups, distinct, pool, single
+from pnu.models.norm import BatchNorm
 from pnu.ops.combine import combine
 from pnu.ops.grouping import gather
 from pnu.ops.nearest import ball_query, knn
@@ -23,12 +24,12 @@ class Layer(nn.Module):
     """
 
     linear: nn.Linear
-    norm: nn.BatchNorm1d
+    norm: BatchNorm
 
     def __init__(self, width_in: int, width_out: int, *, bias: bool = True) -> None:
         super().__init__()
         self.linear = nn.Linear(width_in, width_out, bias=bias)
-        self.norm = nn.BatchNorm1d(width_out)
+        self.norm = BatchNorm(width_out)
         if not bias:
             nn.init.kaiming_normal_(self.linear.weight)
 

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from pnu.models.layers import MLP
+from pnu.models.norm import BatchNorm
 from pnu.models.punet import check_ratio, coordinates
 from pnu.ops.grouping import gather
 from pnu.ops.nearest import knn
@@ -22,7 +23,7 @@ class EdgeConvolution(nn.Module):
         super().__init__()
         self.center = nn.Linear(width_in, width_out)
         self.neighbor = nn.Linear(width_in, width_out, bias=False)
-        self.norm = nn.BatchNorm1d(width_out)
+        self.norm = BatchNorm(width_out)
 
     def forward(self, x: Tensor, neighbors: Tensor) -> Tensor:
         edges = self.center(x)[:, :, None] + gather(self.neighbor(x), neighbors)

@@ -19,11 +19,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 import torch.distributed
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pnu.models.chunks import Chunk, Scratch, group_chunks, row_chunks, spread
 from pnu.models.neighborhoods import Groups, ungroup
+from pnu.models.norm import BatchNorm, everywhere
 
 if TYPE_CHECKING:
     from pnu.models.layers import Layer
@@ -182,7 +183,7 @@ def _statistics(layer: Layer, sign: Tensor | None, counts: Tensor, moments: Tens
     count = counts.sum()
     mean = (counts * means).sum(0) / count
     square = (squares + counts * (means - mean).square()).sum(0)
-    if isinstance(norm, nn.SyncBatchNorm):
+    if norm.synchronized:
         count, total, square = _everywhere(norm, count.expand_as(mean), count * mean, square + count * mean.square())
         mean = total / count
         square = square - count * mean.square()
@@ -196,22 +197,15 @@ def _statistics(layer: Layer, sign: Tensor | None, counts: Tensor, moments: Tens
 
 
 def _track(layer: Layer, mean: Tensor, variance: Tensor) -> None:
-    """Update the running statistics as `nn.BatchNorm1d` does, with the bias that the products lack."""
-    norm, bias = layer.norm, layer.linear.bias
-    if norm.running_mean is None or norm.running_var is None or norm.num_batches_tracked is None:
-        return
-    norm.num_batches_tracked.add_(1)
-    momentum = 1 / norm.num_batches_tracked.item() if norm.momentum is None else norm.momentum
-    norm.running_mean.lerp_((mean if bias is None else mean + bias).to(norm.running_mean.dtype), momentum)
-    norm.running_var.lerp_(variance.to(norm.running_var.dtype), momentum)
+    """Update the running statistics with the bias that the products lack."""
+    bias = layer.linear.bias
+    layer.norm.track(mean if bias is None else mean + bias, variance)
 
 
-def _everywhere(norm: nn.Module, *sums: Tensor) -> list[Tensor]:
+def _everywhere(norm: BatchNorm, *sums: Tensor) -> list[Tensor]:
     """Sums over all processes, where batch norm is to be synchronised."""
     total = torch.stack(sums)
-    if isinstance(norm, nn.SyncBatchNorm) and torch.distributed.is_initialized():
-        torch.distributed.all_reduce(total, group=norm.process_group)
-    return list(total)
+    return list(everywhere(total) if norm.synchronized and torch.distributed.is_initialized() else total)
 
 
 class _Gradient(NamedTuple):
@@ -248,7 +242,7 @@ class _Gradient(NamedTuple):
         return out
 
 
-def _through_statistics(module: nn.Module, norm: Norm, sums: Tensor) -> tuple[Tensor, Tensor]:
+def _through_statistics(module: BatchNorm, norm: Norm, sums: Tensor) -> tuple[Tensor, Tensor]:
     """Slope and level of the gradient that reaches all products alike, from the sums (2, C) of `_rectify`."""
     alone, with_deviation = _everywhere(module, *sums)
     slope = -norm.scale * norm.inverse_deviation.square() * with_deviation / norm.total
