@@ -104,7 +104,7 @@ def read(path: str | PathLike[str]) -> dict[str, Any]:
 
 def write(path: str | PathLike[str], content: Mapping[str, Any]) -> None:
     """Write a checkpoint, whole or not at all."""
-    buffer = io.BytesIO()  # torch's own writing of files takes a full disk for a success
+    buffer = io.BytesIO()  # where torch itself writes to a full disk, its error does not say so
     torch.save(dict(content), buffer)
     with atomic_path(Path(path)) as temporary:
         temporary.write_bytes(buffer.getbuffer())

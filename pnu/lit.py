@@ -68,6 +68,11 @@ class SynchronizedNorms(TorchSyncBatchNorm):
         return synchronize(model, False)
 
 
+def norm_plugins(trainer: Mapping[str, Any]) -> list[SynchronizedNorms]:
+    """What Lightning needs for the trainer's sync_batchnorm."""
+    return [SynchronizedNorms()] if trainer.get("sync_batchnorm") else []
+
+
 class NonFinite(ValueError):
     """NaN or infinity in the loss or its gradient; the message names the step and the term."""
 

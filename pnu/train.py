@@ -59,7 +59,7 @@ def train(cfg: Any) -> list[float] | None:
             "lightning.pytorch",
             callbacks=callbacks.build_all(config, run),
             logger=callbacks.build_logger(config, run),
-            plugins=[lit.SynchronizedNorms()] if config["trainer"].get("sync_batchnorm") else None,
+            plugins=[callbacks.AtomicCheckpointIO(), *lit.norm_plugins(config["trainer"])],
             default_root_dir=run.path,
             **lit.TRAINER_OPTIONS,
         )

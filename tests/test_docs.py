@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from pnu.data import shapes
 from pnu.doctor import open3d_error
-from pnu.io import write_cloud, write_mesh
+from pnu.io import read_cloud, read_mesh, write_cloud, write_mesh
 from pnu.models.pnu import PNU
 from pnu.models.released import rename
 from pnu.ops.surface import sample_area
@@ -154,3 +155,27 @@ def test_links_lead_somewhere(page: str) -> None:
 def test_modules_named_on_a_page_exist(page: str) -> None:
     for module in re.findall(r"python -m (pnu\.\w+)", text(page)):
         assert (ROOT / f"{module.replace('.', '/')}.py").is_file(), module
+
+
+@pytest.mark.parametrize("own", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_example_goes_from_scan_to_mesh(own: bool, tmp_path: Path) -> None:
+    given = []
+    if own:
+        write_cloud(tmp_path / "scan.ply", shapes.make("mug").vertices[:500])
+        given = ["scan.ply", "results"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, ROOT / "docs" / "scan_to_mesh.py", *given]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    folder = tmp_path / ("results" if own else "scan_to_mesh")
+    scan = 500 if own else 1500
+    assert len(read_cloud(folder / "dense.ply").points) == 4 * scan
+    assert np.asarray(Image.open(folder / "steps.png")).std() > 10
+    if not own:
+        distance, angle = (float(value) for value in re.findall(r"([\d.]+)(?:e-3 from| degrees)", done.stdout))
+        assert distance < 4
+        assert angle < 20
+    if open3d_error():
+        assert "no mesh: " in done.stdout
+    else:
+        assert len(read_mesh(folder / "mesh.ply").faces) > 1000

@@ -2,7 +2,9 @@
 
 import json
 import multiprocessing
+import multiprocessing.connection
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -125,8 +127,20 @@ def results_of(jobs: list[tuple[str, Callable[[], Mesh], int, int]], processes: 
     if processes <= 1:
         yield from map(job, jobs)
         return
-    with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), initializer=end_with_parent) as pool:
         yield from pool.map(job, jobs)
+
+
+def end_with_parent() -> None:
+    """Let this process end when the one that started it is gone: it would wait for work for ever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        multiprocessing.connection.wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def job(arguments: tuple[str, Callable[[], Mesh], int, int]) -> tuple[str, Patches]:
