@@ -145,7 +145,8 @@ def test_training(disk: Path, small: list[str]) -> None:  # noqa: F811
     subprocess.run(["mount", "-o", "remount,rw", str(disk)], check=True)
     filler.unlink()
     assert command(disk, *resumed).returncode == 0
-    assert command(disk.parent, "-m", "pnu.train", *options, "run=whole").returncode == 0
-    ours, theirs = read(last), read(disk.parent / "whole/checkpoints/last.ckpt")
+    assert command(disk.parent, "-m", "pnu.train", *first, "run=run").returncode == 0
+    assert command(disk.parent, *resumed).returncode == 0
+    ours, theirs = read(last), read(disk.parent / "run/checkpoints/last.ckpt")
     assert ours["global_step"] == 4
     assert all(torch.equal(ours["state_dict"][name], value) for name, value in theirs["state_dict"].items())

@@ -11,9 +11,11 @@ from pnu.io import (
     MESH_SUFFIXES,
     Mesh,
     atomic_path,
+    meshes_of,
     read_cloud,
     read_json,
     read_mesh,
+    remove_leftovers,
     write_cloud,
     write_json,
     write_mesh,
@@ -401,3 +403,13 @@ def test_bench_clouds(shared: Path) -> None:
         assert cloud.points.shape == cloud.normals.shape == (5000, 3)
     for path in (shared / "bench" / "truth").glob("*.ply"):
         assert volume(read_mesh(path)) > 0
+
+
+def test_hidden_files_are_no_meshes(tmp_path: Path) -> None:
+    """What a killed program left half-written, and what some file managers write beside each file."""
+    for name in ("a.ply", "b/c.off", ".a.0123456789ab.ply", "._a.ply", "notes.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("x")
+    assert meshes_of(tmp_path) == {"a": tmp_path / "a.ply", "b_c": tmp_path / "b/c.off"}
+    remove_leftovers(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["._a.ply", "a.ply", "b", "notes.txt"]

@@ -15,7 +15,7 @@ from pnu.data import shapes
 from pnu.data.augment import from_options
 from pnu.data.dataset import Downsampling, EpochSampler, Options, PatchDataset, check_options, split
 from pnu.data.patchset import build, check
-from pnu.io import MESH_SUFFIXES, Mesh, read_mesh
+from pnu.io import Mesh, meshes_of, read_mesh
 
 
 class PatchDataModule(pl.LightningDataModule):
@@ -218,21 +218,7 @@ class MeshDataModule(GeneratedDataModule):
     def files(self) -> dict[str, Path]:
         if self.root is None:
             raise ValueError("data.root=FOLDER is required: a folder of meshes (ply, off, obj, stl)")
-        root = Path(self.root)
-        if not root.is_dir():
-            raise ValueError(f"data.root={root}: no such folder; expected one with meshes (ply, off, obj, stl)")
-        found = sorted(path for path in root.rglob("*") if path.suffix.lower() in MESH_SUFFIXES)
-        if not found:
-            raise ValueError(f"data.root={root}: expected meshes (ply, off, obj, stl), found none")
-        files: dict[str, Path] = {}
-        for path in found:
-            name = path.relative_to(root).with_suffix("").as_posix().replace("/", "_")
-            if name in files:  # the same shape twice would be in training and in validation
-                raise ValueError(
-                    f"data.root={root}: {files[name]} and {path} are both named {name}; rename or move one"
-                )
-            files[name] = path
-        return files
+        return meshes_of(self.root)
 
     def makers(self) -> dict[str, Callable[[], Mesh]]:
         return {name: functools.partial(read_mesh, path) for name, path in self.files.items()}

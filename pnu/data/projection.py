@@ -1,19 +1,15 @@
 """Data module of the surface model: crops for training, whole clouds of other shapes for validation and test."""
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
-import torch
 from torch.utils.data import DataLoader, Sampler
 
 from pnu.data import shapes
 from pnu.data.crops import Crops, WholeClouds, flattened, stacked
 from pnu.data.truth import Truth
-from pnu.io import Mesh, read_mesh
-
-SUFFIXES = (".ply", ".obj", ".off", ".stl")
+from pnu.io import meshes_of, read_mesh
 
 
 class ProjectionDataModule(pl.LightningDataModule):
@@ -46,7 +42,8 @@ class ProjectionDataModule(pl.LightningDataModule):
     def setup(self, stage: str | None = None) -> None:
         if self.truth is not None:
             return
-        meshes = read_folder(self.root) if self.root else {}
+        files = meshes_of(self.root) if self.root else {}
+        meshes = {name: shapes.unit(read_mesh(path)) for name, path in files.items()}
         if self.procedural:
             meshes |= {name: shapes.make(name) for name in shapes.names()}
         missing = [name for name in self.held_out if name not in meshes]
@@ -100,17 +97,3 @@ class Order(Sampler[tuple[int, int]]):
     def __iter__(self) -> Iterator[tuple[int, int]]:
         start, self.start = self.start, 0
         return iter([(self.epoch, index) for index in range(start, self.length)])
-
-
-def read_folder(root: str) -> dict[str, Mesh]:
-    """Meshes of a folder by name, centred as they are, scaled to the unit sphere."""
-    paths = sorted(path for path in Path(root).glob("*") if path.suffix.lower() in SUFFIXES)
-    if not paths:
-        raise ValueError(f"data.root={root}: expected a folder with meshes ({', '.join(SUFFIXES)}), found none")
-    return {path.stem: to_unit(read_mesh(path)) for path in paths}
-
-
-def to_unit(mesh: Mesh) -> Mesh:
-    center = (mesh.vertices.max(0) + mesh.vertices.min(0)) / 2
-    vertices = torch.from_numpy(mesh.vertices - center)
-    return mesh._replace(vertices=(vertices / vertices.norm(dim=1).max()).numpy())

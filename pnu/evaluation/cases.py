@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from pnu import surfaces
-from pnu.io import CLOUD_SUFFIXES, MESH_SUFFIXES, Mesh, read_cloud, read_mesh
+from pnu.io import CLOUD_SUFFIXES, MESH_SUFFIXES, Mesh, files_of, read_cloud, read_mesh
 from pnu.ops.mesh import open_edges
 from pnu.ops.normalize import Frame
 from pnu.ops.sampling import nonuniform_points
@@ -115,8 +115,8 @@ def pair_cases(
 
 
 def read_truth(folder: Path, shape: str, count: int, seed: int, warn: Warn) -> tuple[Truth, Frame]:
-    meshes = [path for path in files(folder, MESH_SUFFIXES) if path.stem == shape]
-    samples = [path for path in files(folder, {".npy"}) if path.stem.rpartition("_")[0] == shape]
+    meshes = [path for path in files_of(folder, MESH_SUFFIXES) if path.stem == shape]
+    samples = [path for path in files_of(folder, {".npy"}) if path.stem.rpartition("_")[0] == shape]
     if not meshes and not samples:
         raise ValueError(f"{folder}: expected {shape}.ply, the true mesh of clouds/{shape}, or {shape}_<count>.npy")
     mesh = read_mesh(meshes[0]) if meshes else None
@@ -143,7 +143,7 @@ def check_frame(points: np.ndarray, truth: Truth, path: Path) -> None:
 
 def pair_files(root: str | Path) -> list[Path]:
     """The input clouds of a folder of prepared pairs."""
-    clouds = files(Path(root) / "clouds", CLOUD_SUFFIXES)
+    clouds = files_of(Path(root) / "clouds", CLOUD_SUFFIXES)
     if not clouds:
         raise ValueError(f"{root}/clouds: expected clouds ({', '.join(sorted(CLOUD_SUFFIXES))}), found none")
     return clouds
@@ -152,17 +152,6 @@ def pair_files(root: str | Path) -> list[Path]:
 def is_pairs_folder(root: str | Path) -> bool:
     """Whether a folder holds prepared pairs, in clouds/ and truth/."""
     return (Path(root) / "clouds").is_dir() and (Path(root) / "truth").is_dir()
-
-
-def mesh_files(root: str | Path) -> dict[str, Path]:
-    """The meshes of a folder and its subfolders by name."""
-    root = Path(root)
-    if not root.is_dir():
-        raise ValueError(f"data.root={root}: no such folder; expected one with meshes, or with clouds/ and truth/")
-    found = sorted(path for path in root.rglob("*") if path.suffix.lower() in MESH_SUFFIXES)
-    if not found:
-        raise ValueError(f"data.root={root}: expected meshes ({', '.join(sorted(MESH_SUFFIXES))}), found none")
-    return {path.relative_to(root).with_suffix("").as_posix().replace("/", "_"): path for path in found}
 
 
 def generator(seed: int, shape: str, what: str) -> np.random.Generator:
@@ -195,7 +184,3 @@ def moved(cloud: np.ndarray, frame: Frame) -> np.ndarray:
 
 def moved_mesh(mesh: Mesh, frame: Frame) -> Mesh:
     return Mesh(moved(mesh.vertices, frame), mesh.faces)
-
-
-def files(folder: Path, suffixes: Collection[str]) -> list[Path]:
-    return sorted(path for path in folder.glob("*") if path.suffix.lower() in suffixes)

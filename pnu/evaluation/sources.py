@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 from pnu.data import shapes
 from pnu.data.dataset import split
-from pnu.evaluation.cases import KINDS, Case, Warn, is_pairs_folder, mesh_cases, mesh_files, pair_cases, pair_files
-from pnu.io import Mesh, read_mesh
+from pnu.evaluation.cases import KINDS, Case, Warn, is_pairs_folder, mesh_cases, pair_cases, pair_files
+from pnu.io import Mesh, meshes_of, read_mesh
 
 PARTS = ("train", "val", "test", "all")
 
@@ -63,7 +63,7 @@ def source(
     makers: dict[str, Callable[[], Mesh]]
     if data.get("root"):
         name, part = Path(data["root"]).resolve().name, part or "all"
-        makers = {name: functools.partial(read_mesh, path) for name, path in mesh_files(data["root"]).items()}
+        makers = {name: functools.partial(read_mesh, path) for name, path in meshes_of(data["root"]).items()}
     elif data.get("kinds"):
         name, part = "synthetic", part or "test"
         makers = {name: functools.partial(shapes.make, name) for name in shapes.names(*data["kinds"])}

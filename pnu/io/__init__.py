@@ -2,6 +2,7 @@
 
 from pnu.io.atomic import atomic_path, check_writable, read_json, remove_leftovers, write_json
 from pnu.io.cloud import CLOUD_SUFFIXES, Cloud, check_cloud, check_output, keeps_attributes, read_cloud, write_cloud
+from pnu.io.folder import files_of, meshes_of
 from pnu.io.mesh import MESH_SUFFIXES, Mesh, read_mesh, write_mesh
 
 __all__ = [
@@ -13,7 +14,9 @@ __all__ = [
     "check_cloud",
     "check_output",
     "check_writable",
+    "files_of",
     "keeps_attributes",
+    "meshes_of",
     "read_cloud",
     "read_json",
     "read_mesh",
