@@ -127,6 +127,17 @@ def test_mistakes_get_one_line(override: str, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(("choice", "extra"), [("joblib", "sweeps"), ("ray", "ray")])
+def test_a_missing_extra_says_how_to_get_it(choice: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from hydra.core.config_store import ConfigStore
+
+    with composer("train") as compose:  # which loads the plugins
+        kept = ConfigStore.instance().repo["hydra"]["launcher"]["basic.yaml"]
+        monkeypatch.setitem(ConfigStore.instance().repo["hydra"], "launcher", {"basic.yaml": kept})
+        with pytest.raises(ValueError, match=rf"{choice}: is not here; pip install 'pnu\[{extra}\]'"):
+            compose([f"hydra/launcher={choice}"], True)
+
+
 def test_numbers_become_the_type_of_their_key() -> None:
     cfg = compose_config(Train, ["loss.w1=2", "trainer.limit_val_batches=3", "trainer.devices=[0,1]"])
     assert isinstance(cfg.loss.w1, float)

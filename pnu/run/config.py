@@ -9,6 +9,7 @@ from typing import Any
 from pnu.run.schema import check, known_keys, nearest_key
 
 PACKAGE = Path(__file__).resolve().parents[1]
+EXTRAS = dict.fromkeys(("joblib", "submitit_local", "submitit_slurm", "optuna"), "sweeps") | {"ray": "ray"}
 
 
 def config_folder() -> Path:
@@ -34,6 +35,8 @@ def composer(name: str, extra_folder: str | None = None) -> Iterator[Callable[..
             return hydra.compose(name, [*overrides, *search_path], return_hydra_config)
         except MissingConfigException as error:
             group, _, choice = (error.missing_cfg_file or "?").rpartition("/")
+            if group in ("hydra/launcher", "hydra/sweeper") and choice in EXTRAS:
+                raise ValueError(f"{group}={choice}: is not here; pip install 'pnu[{EXTRAS[choice]}]'") from None
             known = ", ".join(sorted(error.options or []))
             raise ValueError(f"{group}={choice}: expected one of {known}" if known else one_line(error)) from None
         except (HydraException, OmegaConfBaseException) as error:
