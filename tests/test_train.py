@@ -367,6 +367,27 @@ def test_a_training_that_breaks_says_so(train: Train, tmp_path: Path, capsys: py
     assert len(list((tmp_path / "run").glob("nonfinite*.pt"))) == 1
 
 
+def test_a_checkpoint_that_cannot_be_written_is_no_success(
+    train: Train, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All checkpoints go through `checkpoint.write`: Lightning's own writing takes a full disk for a success."""
+    content: list[bytes] = []
+
+    def write(path: Path, checkpoint: dict[str, Any]) -> None:
+        content.append((tmp_path / "run/checkpoints/last.ckpt").read_bytes())
+        raise ValueError(f"{path}: cannot be written (No space left on device)")
+
+    run = train("trainer.max_steps=2")
+    before = (run / "checkpoints/last.ckpt").read_bytes()
+    monkeypatch.setattr("pnu.callbacks.write", write)
+    with pytest.raises(SystemExit) as stopped:
+        resume(run, "trainer.max_steps=3")
+    assert stopped.value.code == 2
+    assert "last.ckpt: cannot be written (No space left on device)" in capsys.readouterr().err
+    assert record(run)["status"] == "failed"
+    assert content == [before] == [(run / "checkpoints/last.ckpt").read_bytes()]
+
+
 def test_an_unknown_value_to_monitor_is_named(train: Train, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         train("trainer.max_steps=4", "callbacks.checkpoints.monitor=val/cd")
@@ -425,10 +446,11 @@ def test_early_stopping_stops(train: Train) -> None:
 
 
 def test_deterministic_mode_gives_the_same_bits(train: Train) -> None:
-    runs = [train("trainer.deterministic=true", "trainer.max_steps=2") for _ in range(2)]
-    one, two = (read(run / "checkpoints/last.ckpt")["state_dict"] for run in runs)
-    assert all(torch.equal(one[name], two[name]) for name in one)
-    torch.use_deterministic_algorithms(False)
+    try:
+        one, two = (weights(train("trainer.deterministic=true", "trainer.max_steps=2", run=name)) for name in "ab")
+    finally:
+        torch.use_deterministic_algorithms(False)
+    assert same(one, two)
 
 
 def test_without_validation_and_test(train: Train) -> None:
