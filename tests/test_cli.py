@@ -134,6 +134,7 @@ def test_a_failed_job_leaves_the_others_and_a_record(tmp_path: Path, small: list
 
 def test_killed_and_resumed_as_if_never_stopped(tmp_path: Path, small: list[str]) -> None:
     options = [*small, "callbacks.checkpoints.every_n_steps=1", "trainer.max_epochs=12", "quiet=true"]
+    options += ["model.local_features=false"]
     process = start(tmp_path, *options, f"run={tmp_path / 'killed'}")
     last = tmp_path / "killed/checkpoints/last.ckpt"
     while not last.exists() and process.poll() is None:

@@ -89,7 +89,7 @@ def moments(folder: Path, rng: np.random.Generator, longest: float, writes: int 
 
 def check_whole(run: Path) -> int:
     """Every file of a run folder that is there can be read; the step of its last checkpoint, or 0."""
-    for path in run.glob("*.json"):
+    for path in run.glob("[!.]*.json"):
         json.loads(path.read_text())
     if (run / "config.yaml").exists():
         assert "model" in yaml.safe_load((run / "config.yaml").read_text())
