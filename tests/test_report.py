@@ -24,7 +24,8 @@ from pnu.report import main
 from pnu.study import collect, write_report
 from pnu.study.plot import Axis, axis
 from pnu.study.plots import front
-from pnu.study.settings import effects
+from pnu.study.settings import Setting, effects
+from pnu.study.texts import differing
 from pnu.train import main as train
 from tests.test_page import CHROMIUM, needs_browser
 from tests.test_train import patch_file  # noqa: F401  a fixture
@@ -96,6 +97,13 @@ def test_another_baseline(make: Make, capsys: pytest.CaptureFixture[str]) -> Non
     with pytest.raises(SystemExit):
         main([f"sweep={folder}", "baseline=none"])
     assert "baseline=none: expected one of default, worse, same" in capsys.readouterr().err
+
+
+def test_of_another_class_the_class_alone_is_told() -> None:
+    baseline = Setting("a", {"model._target_": "A", "model.x": 1, "loss.w": 2}, [])
+    other = Setting("b", {"model._target_": "B", "model.y": 3, "loss.w": 4}, [])
+    assert differing(other, baseline) == "model._target_=B, loss.w=4"
+    assert differing(baseline._replace(values=baseline.values | {"model.x": 5}), baseline) == "model.x=5"
 
 
 def test_settings_without_names_are_named_by_what_differs(make: Make) -> None:

@@ -1,5 +1,6 @@
 """The plots of a report: each metric of each setting, effects of numbers, learning curves, points against normals."""
 
+import logging
 import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -132,6 +133,7 @@ def mean_curve(setting: Setting, name: str, points: int = 200) -> Curve:
     """The mean over seeds of a logged value at each step that all have; training values as means over 20 steps."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+    logging.getLogger("tensorboard").setLevel(logging.ERROR)  # it warns of runs that went on after an interruption
     by_step: defaultdict[float, list[float]] = defaultdict(list)
     for run in setting.runs:
         folder = run.folder.path / "tensorboard"

@@ -96,9 +96,11 @@ def cell(study: Study, setting: Setting, metric: str) -> tuple[str, bool]:
 
 
 def differing(setting: Setting, baseline: Setting) -> str:
-    """The keys in which a setting differs from the baseline."""
+    """The keys in which a setting differs from the baseline; of a group with another class, the class alone."""
     keys = dict.fromkeys([*setting.values, *baseline.values])
     found = {key: setting.values.get(key, "-") for key in keys if setting.values.get(key) != baseline.values.get(key)}
+    replaced = tuple(key.removesuffix("_target_") for key in found if key.endswith("._target_"))
+    found = {key: value for key, value in found.items() if key.endswith("._target_") or not key.startswith(replaced)}
     return ", ".join(f"{key}={short(value)}" for key, value in found.items())
 
 
