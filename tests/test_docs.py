@@ -70,7 +70,7 @@ def lay_out(folder: Path, cache: Path) -> None:
     write_cloud(folder / "scan.ply", cloud[:, :3], cloud[:, 3:])
     write_mesh(folder / "mesh.ply", shapes.make("mug"))
     (folder / "meshes").mkdir()
-    for name in shapes.names()[:4]:
+    for name in [*shapes.names()[:3], "mug"]:
         write_mesh(folder / "meshes" / f"{name}.ply", shapes.make(name))
     (folder / "data").symlink_to(cache)  # patches of the procedural shapes are cut once for all pages
     released_checkpoint(folder / "epoch_N.pt")
