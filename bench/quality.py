@@ -1,7 +1,7 @@
 """How good upsampled clouds are: `python -m bench.quality [FOLDER] [--settings given noise_1 ...] [--methods ...]`.
 
 FOLDER holds pairs, clouds/NAME.xyz with normals and truth/NAME.ply with truth/NAME_<count>.npy; without it the test
-part of the procedural shapes is drawn. Each setting changes these inputs in one way; all methods get the same ones, with
+part of the procedural shapes is drawn. Each setting changes these inputs in one way; all methods get the same ones with
 the same estimated normals where a setting gives none. --surfaces measures Poisson surfaces, of the input and of its
 dense versions. Every setting is kept in OUTPUT/quality_<setting>.json, and OUTPUT/quality.md has the tables of all.
 """

@@ -15,6 +15,7 @@ class Train:
     name: str = doc("last part of the run folder's name")
     run: str | None = doc("run folder; null: outputs/<date>/<time>_<name>")
     resume: bool = doc("go on with the run in run=FOLDER, with its config, from its last checkpoint")
+    weights: str | None = doc("to start from: run folder, or weights that come with pnu; null: drawn by the seed")
     threads: int | None = doc("threads of a training on the CPU; null: one for each core; small patches want one")
     quiet: bool = doc("print the run folder alone")
     sweep: str | None = doc("name of a sweep (-m) below outputs/sweeps; null: made of the command line")
@@ -40,8 +41,7 @@ def train(cfg: Any) -> list[float] | None:
         import lightning.pytorch as pl  # seconds: only once the config is known to be good
         import torch
 
-        from pnu import callbacks, lit, models
-        from pnu.checkpoint import read
+        from pnu import callbacks, checkpoint, lit, models
 
         lit.quieten()
         lit.keep_threads()
@@ -50,6 +50,8 @@ def train(cfg: Any) -> list[float] | None:
         pl.seed_everything(config["seed"], verbose=False)
         data = build(config["data"], "pnu.data")
         model = models.build(config["model"])
+        if source := config.get("weights"):
+            checkpoint.fill(model, checkpoint.load(source).state_dict(), source)
         loss = build(config["loss"], "pnu.losses")
         optimizer = build(config["optimizer"], "torch.optim")
         scheduler = build(config["scheduler"], "torch.optim.lr_scheduler")
@@ -69,7 +71,7 @@ def train(cfg: Any) -> list[float] | None:
             run.add_metrics("untrained", trainer.validate(module, data, verbose=False))
         trainer.fit(module, data, ckpt_path=start, weights_only=True)
         if run.best.exists():
-            module.load_state_dict(read(run.best)["state_dict"])
+            module.load_state_dict(checkpoint.read(run.best)["state_dict"])
         run.add_metrics("test", trainer.test(module, data, verbose=False))
         result = objective(config, run)
     if is_main_process():

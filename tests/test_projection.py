@@ -224,3 +224,37 @@ def test_most_doubtful_points_are_dropped() -> None:
     kept = torch.isin(points[:, 0], dense[:, 0])
     assert kept.sum() == 600
     assert error[kept].max() <= error[~kept].min()
+
+
+def test_noisy_points_are_smoothed_first() -> None:
+    """Of a cloud that is noisy beside its spacing, and of no other."""
+    model, stages = Surface(), set()
+    for noise in (0.0, 0.02):
+        cloud = sphere(800)
+        shift = torch.randn(800, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        cloud[:, :3] += noise * shift
+        seen: set[str] = set()
+        dense = model.upsample_cloud(cloud, 1600, progress=lambda stage, done, total, seen=seen: seen.add(stage))
+        assert ("smoothing, the points are noisy" in seen) == (noise > 0)
+        stages |= seen
+        assert float((dense[:, :3].norm(dim=1) - 1).abs().mean()) < max(0.5 * noise, 0.002)
+    assert {"projection", "refinement 1", "refinement 2"} <= stages
+
+
+def test_no_refinement_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"model\.refinements=0: expected at least 1"):
+        Surface(refinements=0)
+
+
+def test_training_seeds_are_spread_and_pushed_outward() -> None:
+    patch = sphere(300).float()[None]
+    patch = patch[:, (patch[0, :, :3] - patch[0, 0, :3]).norm(dim=1).argsort()]
+    seeds, push = Surface(queries=20).training_seeds(patch)
+    assert seeds.shape == push.shape == (1, 20, 6)
+    assert (push[..., 3:] == 0).all()
+    apart = torch.cdist(seeds[0, :, :3], seeds[0, :, :3]).fill_diagonal_(torch.inf).amin(1)
+    all_discs = tangent_discs(patch[0, :, :3], patch[0, :, 3:], 3, first=20).flatten(0, 1)
+    crowded = torch.cdist(all_discs, all_discs).fill_diagonal_(torch.inf).amin(1)
+    assert apart.min() > 2 * crowded.min()
+    parents = seeds[0, :, :3] - push[0, :, :3] / 0.1
+    assert torch.cdist(parents, patch[0, :20, :3]).amin(1).max() < 1e-4

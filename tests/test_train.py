@@ -459,3 +459,18 @@ def test_without_validation_and_test(train: Train) -> None:
     assert record(run)["status"] == "finished"
     assert json.loads((run / "metrics.json").read_text()) == {"untrained": {}, "test": {}}
     assert not (run / "checkpoints/best.ckpt").exists()
+
+
+def test_training_goes_on_from_given_weights(train: Train, finished: Path) -> None:
+    """Started from a run's weights, the network before its first step is that run's."""
+    first = train("trainer.max_steps=1", f"weights={finished}", "seed=9")
+    metrics = json.loads((first / "metrics.json").read_text())
+    before = json.loads((finished / "metrics.json").read_text())
+    assert metrics["untrained"]["chamfer_sq"] == pytest.approx(before["validation"]["chamfer_sq"], rel=1e-4)
+    assert metrics["untrained"]["chamfer_sq"] != pytest.approx(before["untrained"]["chamfer_sq"], rel=1e-2)
+
+
+def test_weights_of_another_network_are_refused(train: Train, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        train("trainer.max_steps=1", "weights=surface")
+    assert "error: surface: expected the state of PNU" in capsys.readouterr().err

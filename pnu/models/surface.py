@@ -12,10 +12,16 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from pnu.ops.frames import FEATURES, local_frames
+from pnu.ops.grouping import gather
 from pnu.ops.nearest import knn
-from pnu.ops.sampling import farthest_points_large
+from pnu.ops.noise import noise_level
+from pnu.ops.sampling import farthest_points, farthest_points_large
+from pnu.ops.spacing import spacing
 from pnu.ops.spread import repel, tangent_discs
 
+EACH = 3  # seeds of a point, in training, before they are thinned out
+PUSH = 0.1  # between rounds of training, beside the way from its point to a seed
+SMOOTH = 0.1  # noise in spacings from which on a cloud is smoothed first
 DENSE = 16  # neighbours that are all looked at; farther ones are thinned out
 
 
@@ -26,7 +32,7 @@ class Projector(nn.Module):
         super().__init__()
         self.sphere, self.attend = sphere, attention
         self.first, self.second = nn.Linear(FEATURES, width), nn.Linear(width, width)
-        self.context = nn.Linear(2 * width, width)
+        self.context = nn.Linear(2 * width + 1, width)
         self.third = nn.Linear(width, width)
         self.attention = nn.Linear(width, width + 2)
         self.head = nn.Sequential(nn.Linear(3 * width, 2 * width), nn.ReLU(), nn.Linear(2 * width, width), nn.ReLU())
@@ -41,7 +47,7 @@ class Projector(nn.Module):
         with torch.no_grad():
             frame = local_frames(offsets, normals, hint, sphere=self.sphere)
         y = self.second(self.first(frame.features).relu()).relu()
-        context = self.context(torch.cat([y.amax(1), (self.shares(y) * y).sum(1)], -1))
+        context = self.context(torch.cat([y.amax(1), (self.shares(y) * y).sum(1), frame.height], -1))
         y = (self.third(y) + context[:, None]).relu()
         share = self.shares(self.attention(y))
         out = self.out(self.head(torch.cat([y.amax(1), (share[..., :-2] * y).sum(1), context], -1)))
@@ -58,17 +64,18 @@ class Projector(nn.Module):
 
 
 class Surface(nn.Module):
-    """Upsampling by learned projection: seeds, projection, rejection, farthest points, even spacing, projection.
+    """Upsampling by learned projection: seeds, projection, farthest points, even spacing, projection, rejection.
 
     Args:
         ratio: points out for each point in, where none is asked for (`upsample_cloud` takes any count).
         neighbours: input points that a seed looks at.
         reach: rank of the farthest of them; beyond the 16 nearest they are thinned out evenly.
         width: of the network.
-        rounds: projections in training; at work the last one follows the even spacing.
+        rounds: projections in training; at work there are 1 + `refinements`.
         seeds: seeds for each point wanted.
         candidates: seeds for each point wanted after they were thinned out to an even spacing.
         relaxation: steps of even spacing.
+        refinements: projections after it; one more is nearer to the surface and a little less even.
         reject: share of the points that is made too many; those with the highest expected error are dropped in the end.
         queries: seeds of a crop, in training.
         sphere: start from the sphere that fits the neighbours (algebraic point set surface), not from the seed.
@@ -80,7 +87,8 @@ class Surface(nn.Module):
 
     def __init__(
         self, ratio: int = 4, neighbours: int = 24, reach: int = 24, width: int = 64, rounds: int = 2,
-        seeds: float = 3, candidates: float = 1.5, relaxation: int = 4, reject: float = 0.003, queries: int = 64,
+        seeds: float = 3, candidates: float = 1.5, relaxation: int = 4,
+        refinements: int = 2, reject: float = 0.003, queries: int = 64,
         sphere: bool = True, attention: bool = True,
     ) -> None:  # fmt: skip
         super().__init__()
@@ -88,9 +96,11 @@ class Surface(nn.Module):
             raise ValueError(
                 f"model.reach={reach}: expected at least model.neighbours={neighbours}, which is at least 4"
             )
+        if refinements < 1:
+            raise ValueError(f"model.refinements={refinements}: expected at least 1")
         self.ratio, self.neighbours, self.reach, self.rounds = ratio, neighbours, reach, rounds
         self.seeds, self.candidates, self.relaxation, self.reject = seeds, candidates, relaxation, reject
-        self.queries = queries
+        self.refinements, self.queries = refinements, queries
         self.projector = Projector(width, sphere=sphere, attention=attention)
 
     def outputs(self, patch: Tensor) -> dict[str, Tensor]:
@@ -99,17 +109,28 @@ class Surface(nn.Module):
         "query" and "projected" (rounds, B, queries, 6) before and after each round, "log_error" and "spacing"
         (rounds, B, queries); "prediction" is the last of "projected". A query has no gradient.
         """
-        count = self.queries
-        seeds = torch.stack([tangent_discs(p[:, :3], p[:, 3:], 1)[:count, 0] for p in patch])
-        query = torch.cat([seeds, patch[:, :count, 3:]], -1)
+        query, outward = self.training_seeds(patch)
         found: list[tuple[Tensor, ...]] = []
         for _ in range(self.rounds):
             projected, log_error, spacing = self.project(query, patch)
             found.append((query, projected, log_error, spacing))
-            query = projected.detach()
+            query = projected.detach() + outward
         names = ("query", "projected", "log_error", "spacing")
         outputs = dict(zip(names, (torch.stack(values) for values in zip(*found, strict=True)), strict=True))
         return outputs | {"prediction": outputs["projected"][-1]}
+
+    def training_seeds(self, patch: Tensor) -> tuple[Tensor, Tensor]:
+        """Seeds around the first points of patches (B, n, 6), (B, queries, 6), and a push of each, (B, queries, 6).
+
+        As at work seeds are thinned out, so that many lie in holes and beyond edges, and pushed on between rounds.
+        """
+        count = self.queries
+        discs = torch.stack([tangent_discs(p[:, :3], p[:, 3:], EACH, first=count) for p in patch])
+        parents = patch[:, :count, None].expand(-1, -1, EACH, -1)
+        seeds = torch.cat([discs, parents[..., 3:]], -1).flatten(1, 2)
+        push = torch.cat([PUSH * (discs - parents[..., :3]), torch.zeros_like(discs)], -1).flatten(1, 2)
+        kept = farthest_points(seeds[..., :3], count)
+        return gather(seeds, kept), gather(push, kept)
 
     def project(self, query: Tensor, clouds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """query (B, m, 6), clouds (B, n, 6) -> projected (B, m, 6), log error (B, m), spacing (B, m)."""
@@ -150,18 +171,24 @@ class Surface(nn.Module):
         generator: torch.Generator | None = None,
         progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
     ) -> Tensor:
-        """cloud (n, 6) -> (count, 6) with unit normals. Nothing is random; batch_size: queries at once."""
+        """cloud (n, 6) -> (count, 6) with unit normals. Nothing is random; batch_size: queries at once.
+
+        The points of a cloud that is noisy beside their spacing are themselves projected first.
+        """
+        if noise_in_spacings(cloud) > SMOOTH:
+            cloud, _ = self.in_batches(cloud, cloud, batch_size, progress, "smoothing, the points are noisy")
         each = max(1, round(self.seeds * count / len(cloud)))
         discs = tangent_discs(cloud[:, :3], cloud[:, 3:], each)
         hints = cloud[:, None, 3:].expand(-1, each, -1)
         query = torch.cat([cloud, torch.cat([discs, hints], -1).flatten(0, 1)])
         query = thin(query, round(self.candidates * count))
-        query, _ = self.in_batches(query, cloud, batch_size, progress, "projection")
+        query, error = self.in_batches(query, cloud, batch_size, progress, "projection")
         query = thin(query, round((1 + self.reject) * count))
         if self.relaxation:
             query = torch.cat([repel(query[:, :3], query[:, 3:], steps=self.relaxation), query[:, 3:]], 1)
-        dense, error = self.in_batches(query, cloud, batch_size, progress, "refinement")
-        return dense[error.argsort(stable=True)[:count].sort().values]
+        for i in range(self.refinements):
+            query, error = self.in_batches(query, cloud, batch_size, progress, f"refinement {i + 1}")
+        return query[error.argsort(stable=True)[:count].sort().values]
 
     def in_batches(
         self,
@@ -172,7 +199,7 @@ class Surface(nn.Module):
         stage: str,
     ) -> tuple[Tensor, Tensor]:
         """query (m, 6) -> projected (m, 6) and logarithm of the expected error (m,)."""
-        size = batch_size or (1024 if cloud.device.type == "cpu" else 2**16)
+        size = batch_size or (512 if cloud.device.type == "cpu" else 2**16)
         parts = []
         for start in range(0, len(query), size):
             progress(stage, start, len(query))
@@ -180,6 +207,11 @@ class Surface(nn.Module):
             parts.append((projected[0], log_error[0] + spacing[0].log()))
         progress(stage, len(query), len(query))
         return torch.cat([p for p, _ in parts]), torch.cat([e for _, e in parts])
+
+
+def noise_in_spacings(cloud: Tensor) -> float:
+    """Noise of a cloud (n, 6) in units of the spacing of its points."""
+    return noise_level(cloud[:, :3], cloud[:, 3:]) / spacing(cloud[:, :3].cpu().numpy())
 
 
 def thin(cloud: Tensor, count: int) -> Tensor:

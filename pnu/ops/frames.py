@@ -19,6 +19,7 @@ class LocalFrames(NamedTuple):
     base: Tensor  # (m, 3) foot of the query on the sphere that fits its neighbours, relative to the query
     axes: Tensor  # (m, 3, 3) rows x, y and z; z is the sphere's normal; orthonormal, of either hand
     spacing: Tensor  # (m, 1) mean distance of the neighbours, the unit of length
+    height: Tensor  # (m, 1) of the query above the foot, in spacings
     features: Tensor  # (m, k, 11): position 0:3, normal 3:6, then lengths and products of them
 
 
@@ -47,7 +48,7 @@ def local_frames(offsets: Tensor, normals: Tensor, hint: Tensor, *, sphere: bool
     seen = (normals * hint[:, None]).sum(-1, keepdim=True)
     share = weights[..., None] * weights.shape[1]
     features = torch.cat([local, local_normals, local.norm(dim=-1, keepdim=True), bent, height, seen, share], -1)
-    return LocalFrames(step * spacing, axes, spacing, features)
+    return LocalFrames(step * spacing, axes, spacing, -(step * z).sum(-1, keepdim=True), features)
 
 
 def _tangents(x: Tensor, normals: Tensor, z: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,17 +13,19 @@ GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 RANK = 12  # of the neighbour that a disc of seeds reaches
 
 
-def tangent_discs(points: Tensor, normals: Tensor, count: int, *, rank: int = RANK) -> Tensor:
+def tangent_discs(points: Tensor, normals: Tensor, count: int, *, rank: int = RANK, first: int | None = None) -> Tensor:
     """Seeds on a disc around each point in its tangent plane, as wide as the rank-th neighbour is far.
 
-    points, normals (n, 3) -> (n, count, 3). Evenly spread by area (a sunflower), turned from point to point and
-    measured from the direction of the nearest neighbour: nothing is random, and seeds turn and grow with the cloud.
-    The discs overlap, so that seeds also lie in holes between the points.
+    points, normals (n, 3) -> (n, count, 3), or (first, count, 3) around the first points alone. Evenly spread by area
+    (a sunflower), turned from point to point and measured from the direction of the nearest neighbour: nothing is
+    random, and seeds turn and grow with the cloud. The discs overlap, so that seeds also lie in holes between points.
     """
     rank = min(rank, len(points) - 1)
-    found = knn(points[None], points[None], rank + 1)
+    cloud = points
+    points, normals = points[:first], normals[:first]
+    found = knn(points[None], cloud[None], rank + 1)
     radius = found.dist_sq[0, :, -1:].sqrt()
-    toward = points[found.idx[0, :, 1]] - points
+    toward = cloud[found.idx[0, :, 1]] - points
     along = toward - (toward * normals).sum(-1, keepdim=True) * normals
     short = along.norm(dim=-1, keepdim=True) <= 1e-6 * radius
     along = normalize(torch.where(short, tangent_basis(normals)[0], along), dim=-1)

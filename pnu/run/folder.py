@@ -161,6 +161,8 @@ def new_path(name: str) -> Path:
 def config_hash(config: Mapping[str, Any]) -> str:
     """Of what determines the result; the same for two runs that compute the same."""
     content = {key: value for key, value in config.items() if key not in UNHASHED}
+    if content.get("weights") is None:  # a key that older runs lack
+        content.pop("weights", None)
     if isinstance(content.get("data"), Mapping):
         content["data"] = {key: value for key, value in content["data"].items() if key not in UNHASHED_DATA}
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]

@@ -72,6 +72,7 @@ class Model:
     seeds: float = doc("seeds for each point wanted")
     candidates: float = doc("of them, after thinning out to even spacing")
     relaxation: int = doc("steps of even spacing; 0: none")
+    refinements: int = doc("projections after the even spacing")
     reject: float = doc("share of points made too many; those with the highest expected error are dropped")
     sphere: bool = doc("start from the sphere that fits the neighbours, not from the seed")
     attention: bool = doc("weigh the neighbours; without it all count alike")
