@@ -6,9 +6,12 @@ import torch
 from torch import Tensor
 
 from pnu.ops.nearest import gpu_kernels, nearest, per_cloud
+from pnu.ops.thinning import farthest_in_blocks
 
 NEAR_ORIGIN_SQ = 1e-3  # the released code's threshold on |x|^2
 BUCKETS_PAY = 2**16  # from this many distances on
+LARGE = 2**18  # points; more are sampled in blocks,
+LARGE_SHARE = 64  # unless so few are wanted that blocks would hold too few of them
 
 
 def farthest_points(points: Tensor, m: int, *, start: int | Tensor = 0, skip_near_origin: bool = False) -> Tensor:
@@ -43,11 +46,17 @@ def farthest_points(points: Tensor, m: int, *, start: int | Tensor = 0, skip_nea
 def farthest_points_large(points: np.ndarray | Tensor, m: int) -> np.ndarray:
     """`farthest_points` from point 0 of one whole cloud (n, 3), in NumPy: idx (m,) int64, exactly m, all different.
 
-    Linear memory; 1M -> 250k points take seconds. ValueError if m is not in 1..n.
+    Beyond LARGE points it works block by block (`pnu.ops.thinning`), as evenly but from another point on, in time
+    linear in n. ValueError if m is not in 1..n.
     """
     xyz = points.detach().cpu() if isinstance(points, Tensor) else torch.from_numpy(np.ascontiguousarray(points))
     _check_count(m, len(xyz))
-    return _farthest(_float32(xyz[None])[0].numpy(), m, 0)
+    array = _float32(xyz[None])[0].numpy()
+    if len(array) <= LARGE or m < len(array) // LARGE_SHARE:
+        return _farthest(array, m, 0)
+    return farthest_in_blocks(
+        array, m, lambda part, number: _farthest(part, number, 0), threads=torch.get_num_threads()
+    )
 
 
 def random_points(points: Tensor, m: int, *, generator: torch.Generator) -> Tensor:

@@ -1,0 +1,67 @@
+"""Blocks of a large cloud: compact, of bounded size, each with the points around it."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Points = NDArray[np.floating]
+Index = NDArray[np.int64]
+
+
+class Blocks(NamedTuple):
+    """A cloud cut into b blocks; every point is in one."""
+
+    members: list[Index]  # points of each block
+    low: Points  # (b, 3) and
+    high: Points  # (b, 3): corners of the boxes that hold them
+
+    def near(self, number: int, margin: float) -> list[int]:
+        """Other blocks whose boxes are at most `margin` away, in each axis, from the box of a block."""
+        apart = np.maximum(self.low - self.high[number], self.low[number] - self.high).max(1)
+        return [other for other in np.flatnonzero(apart <= margin).tolist() if other != number]
+
+    def inside(self, points: Points, number: int, margin: float) -> NDArray[np.bool_]:
+        """Which points (n, 3) lie in the box of a block, grown by `margin` on all sides."""
+        return ((points >= self.low[number] - margin) & (points <= self.high[number] + margin)).all(1)
+
+    def halo(self, points: Points, number: int, margin: float) -> Index:
+        """Points of the cloud that are no members of a block but in its box, grown by `margin`."""
+        parts = [np.empty(0, np.int64)]
+        for other in self.near(number, margin):
+            members = self.members[other]
+            parts.append(members[self.inside(points[members], number, margin)])
+        return np.concatenate(parts)
+
+    def colors(self, margin: float) -> list[list[int]]:
+        """Groups of blocks, no two of a group within `margin` of each other."""
+        groups: list[list[int]] = []
+        taken: list[set[int]] = []
+        for number in range(len(self.members)):
+            near = set(self.near(number, margin))
+            free = next((i for i, group in enumerate(taken) if not near & group), len(taken))
+            if free == len(taken):
+                taken.append(set())
+                groups.append([])
+            taken[free].add(number)
+            groups[free].append(number)
+        return groups
+
+
+def split(points: Points, size: int) -> Blocks:
+    """Blocks of at most `size` of the points (n, 3), by halving the longest side of the box, always at the median."""
+    members: list[Index] = []
+    boxes: list[tuple[Points, Points]] = []
+    todo = [np.arange(len(points))]
+    while todo:
+        part = todo.pop()
+        place = points[part]
+        low, high = place.min(0), place.max(0)
+        if len(part) <= size:
+            members.append(np.sort(part))
+            boxes.append((low, high))
+            continue
+        half = len(part) // 2
+        order = np.argpartition(place[:, (high - low).argmax()], half)
+        todo += [part[order[half:]], part[order[:half]]]
+    return Blocks(members, np.array([low for low, _ in boxes]), np.array([high for _, high in boxes]))
