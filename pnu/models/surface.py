@@ -22,6 +22,7 @@ from pnu.ops.spread import repel, tangent_discs
 EACH = 3  # seeds of a point, in training, before they are thinned out
 PUSH = 0.1  # between rounds of training, beside the way from its point to a seed
 SMOOTH = 0.1  # noise in spacings from which on a cloud is smoothed first
+SEARCHED = 2**19  # queries whose neighbours are searched at once: the search sorts the whole cloud first
 DENSE = 16  # neighbours that are all looked at; farther ones are thinned out
 
 
@@ -132,13 +133,14 @@ class Surface(nn.Module):
         kept = farthest_points(seeds[..., :3], count)
         return gather(seeds, kept), gather(push, kept)
 
-    def project(self, query: Tensor, clouds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """query (B, m, 6), clouds (B, n, 6) -> projected (B, m, 6), log error (B, m), spacing (B, m)."""
+    def project(self, query: Tensor, clouds: Tensor, idx: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """query (B, m, 6), clouds (B, n, 6) -> projected (B, m, 6), log error (B, m), spacing (B, m).
+
+        idx: their `neighbors`, where they are known.
+        """
         batch, m, _ = query.shape
         like = self.projector.out.weight
-        idx = knn(query[..., :3], clouds[..., :3], min(self.reach, clouds.shape[1])).idx[
-            ..., self.ranks(clouds.shape[1])
-        ]
+        idx = self.neighbors(query, clouds) if idx is None else idx
         near = clouds[torch.arange(batch, device=idx.device)[:, None, None], idx]
         offsets = (near[..., :3] - query[:, :, None, :3]).flatten(0, 1).to(like)
         step, normal, log_error, spacing = self.projector(
@@ -150,6 +152,11 @@ class Surface(nn.Module):
             log_error.view(batch, m),
             spacing.view(batch, m),
         )
+
+    def neighbors(self, query: Tensor, clouds: Tensor) -> Tensor:
+        """Points of clouds (B, n, 6) that queries (B, m, 6) look at: (B, m, k)."""
+        n = clouds.shape[1]
+        return knn(query[..., :3], clouds[..., :3], min(self.reach, n)).idx[..., self.ranks(n)]
 
     def ranks(self, n: int) -> list[int]:
         """Ranks of the neighbours that are looked at, of those that a cloud of n points has."""
@@ -178,10 +185,7 @@ class Surface(nn.Module):
         if noise_in_spacings(cloud) > SMOOTH:
             cloud, _ = self.in_batches(cloud, cloud, batch_size, progress, "smoothing, the points are noisy")
         each = max(1, round(self.seeds * count / len(cloud)))
-        discs = tangent_discs(cloud[:, :3], cloud[:, 3:], each)
-        hints = cloud[:, None, 3:].expand(-1, each, -1)
-        query = torch.cat([cloud, torch.cat([discs, hints], -1).flatten(0, 1)])
-        query = thin(query, round(self.candidates * count))
+        query = seeds_around(cloud, each, round(self.candidates * count))
         query, error = self.in_batches(query, cloud, batch_size, progress, "projection")
         query = thin(query, round((1 + self.reject) * count))
         if self.relaxation:
@@ -201,10 +205,14 @@ class Surface(nn.Module):
         """query (m, 6) -> projected (m, 6) and logarithm of the expected error (m,)."""
         size = batch_size or (512 if cloud.device.type == "cpu" else 2**16)
         parts = []
-        for start in range(0, len(query), size):
-            progress(stage, start, len(query))
-            projected, log_error, spacing = self.project(query[None, start : start + size], cloud[None])
-            parts.append((projected[0], log_error[0] + spacing[0].log()))
+        for first in range(0, len(query), SEARCHED):
+            searched = query[None, first : first + SEARCHED]
+            idx = self.neighbors(searched, cloud[None])
+            for start in range(0, searched.shape[1], size):
+                progress(stage, first + start, len(query))
+                part = slice(start, start + size)
+                projected, log_error, spacing = self.project(searched[:, part], cloud[None], idx[:, part])
+                parts.append((projected[0], log_error[0] + spacing[0].log()))
         progress(stage, len(query), len(query))
         return torch.cat([p for p, _ in parts]), torch.cat([e for _, e in parts])
 
@@ -212,6 +220,19 @@ class Surface(nn.Module):
 def noise_in_spacings(cloud: Tensor) -> float:
     """Noise of a cloud (n, 6) in units of the spacing of its points."""
     return noise_level(cloud[:, :3], cloud[:, 3:]) / spacing(cloud[:, :3].cpu().numpy())
+
+
+def seeds_around(cloud: Tensor, each: int, count: int) -> Tensor:
+    """Points of a cloud (n, 6) and `each` seeds around each, thinned to (count, 6), with the points' normals."""
+    discs = tangent_discs(cloud[:, :3], cloud[:, 3:], each)
+    places = torch.cat([cloud[:, :3], discs.flatten(0, 1)])
+    del discs
+    if len(places) <= count:
+        kept = torch.arange(len(places), device=cloud.device)
+    else:
+        kept = torch.from_numpy(farthest_points_large(places, count)).to(cloud.device)
+    owner = torch.where(kept < len(cloud), kept, (kept - len(cloud)) // each)
+    return torch.cat([places[kept], cloud[owner, 3:]], 1)
 
 
 def thin(cloud: Tensor, count: int) -> Tensor:

@@ -10,6 +10,7 @@ from pnu.ops.frames import tangent_basis
 from pnu.ops.nearest import knn
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+ROWS = 2**18  # points whose neighbours are gathered at once: bounds the memory
 RANK = 12  # of the neighbour that a disc of seeds reaches
 
 
@@ -31,13 +32,18 @@ def tangent_discs(points: Tensor, normals: Tensor, count: int, *, rank: int = RA
     along = normalize(torch.where(short, tangent_basis(normals)[0], along), dim=-1)
     across = torch.linalg.cross(normals, along)
     seed = torch.arange(count, device=points.device, dtype=points.dtype)
-    point = torch.arange(len(points), device=points.device, dtype=points.dtype)[:, None]
-    share = (seed + (point * (1 / GOLDEN_ANGLE)).frac()) / count
-    angle = GOLDEN_ANGLE * (seed + count * point)
-    r = radius * share.sqrt()
-    return (
-        points[:, None] + (r * angle.cos())[..., None] * along[:, None] + (r * angle.sin())[..., None] * across[:, None]
-    )
+    discs = points.new_empty(len(points), count, 3)
+    for part in torch.arange(len(points), device=points.device).split(max(ROWS // count, 1)):
+        point = part[:, None].to(points.dtype)
+        share = (seed + (point * (1 / GOLDEN_ANGLE)).frac()) / count
+        angle = GOLDEN_ANGLE * (seed + count * point)
+        r = radius[part] * share.sqrt()
+        discs[part] = (
+            points[part, None]
+            + (r * angle.cos())[..., None] * along[part, None]
+            + (r * angle.sin())[..., None] * across[part, None]
+        )
+    return discs
 
 
 def repel(points: Tensor, normals: Tensor, *, steps: int, neighbours: int = 8) -> Tensor:
@@ -51,10 +57,13 @@ def repel(points: Tensor, normals: Tensor, *, steps: int, neighbours: int = 8) -
         found = knn(points[None], points[None], k)
         dist, idx = found.dist_sq[0, :, 1:].sqrt(), found.idx[0, :, 1:]
         radius = 1.25 * dist[:, :6].mean(1).median()
-        away = points[:, None] - points[idx]
-        alike = (normals[:, None] * normals[idx]).sum(-1) > -0.2
-        force = (1 - dist / radius).clamp(min=0) * alike / dist.clamp(min=1e-9 * radius)
-        push = 0.5 * radius * (force[..., None] * away).sum(1)
-        push = push - (push * normals).sum(-1, keepdim=True) * normals
-        points = points + push * (0.3 * radius / push.norm(dim=-1, keepdim=True).clamp(min=0.3 * radius))
+        moved = []
+        for part in torch.arange(len(points), device=points.device).split(ROWS):
+            away = points[part, None] - points[idx[part]]
+            alike = (normals[part, None] * normals[idx[part]]).sum(-1) > -0.2
+            force = (1 - dist[part] / radius).clamp(min=0) * alike / dist[part].clamp(min=1e-9 * radius)
+            push = 0.5 * radius * (force[..., None] * away).sum(1)
+            push = push - (push * normals[part]).sum(-1, keepdim=True) * normals[part]
+            moved.append(points[part] + push * (0.3 * radius / push.norm(dim=-1, keepdim=True).clamp(min=0.3 * radius)))
+        points = torch.cat(moved)
     return points
