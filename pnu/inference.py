@@ -1,11 +1,13 @@
 """Densify whole clouds with a trained network: no Hydra, no Lightning, usable from a notebook."""
 
+import hashlib
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Protocol, cast, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 import torch
@@ -13,16 +15,19 @@ from torch import Tensor, nn
 
 from pnu import checkpoint
 from pnu.io import Cloud, check_cloud
+from pnu.models.surface import Surface
 from pnu.ops import patches
 from pnu.ops.attributes import carry
 from pnu.ops.nearest import nearest
 from pnu.ops.normalize import Frame, unit_sphere_frame
 from pnu.ops.normals import estimate_normals, flip_to_reference
+from pnu.ops.parts import Keep, Parts, forget
 
 MINIMUM = 16  # points of a cloud
 SMALLEST_PATCH = 64  # points that every network accepts; a smaller cloud is repeated up to it
 LARGEST = 10**9  # points of an output
 SLACK = 1.1  # growth beyond the network's ratio for which overlapping patches have points enough
+KEPT = 256  # patches whose predictions are kept in one file
 ZERO = 1e-6  # predicted normals shorter than this have no direction
 
 Progress = Callable[[str, int, int], None]
@@ -53,6 +58,7 @@ def upsample(
     batch_size: int | None = None,
     seed: int = 0,
     progress: Progress | None = None,
+    parts: str | PathLike[str] | None = None,
 ) -> np.ndarray:
     """A denser cloud on the same surface.
 
@@ -73,6 +79,7 @@ def upsample(
         batch_size: patches at once on a GPU, by default 64; on the CPU each thread takes one.
         seed: of models that draw random numbers; the paper's procedure draws none.
         progress: called as progress(stage, done, total).
+        parts: folder for finished parts of a long computation; the same call goes on from them after an interruption.
 
     Returns:
         (round(ratio n), 6) float64: points in the frame and unit of the input, and unit normals.
@@ -90,12 +97,15 @@ def upsample(
     upsampler = network if isinstance(network, CloudUpsampler) else Patchwise(network, patch_size)
     sparse, frame = _prepare(given, progress)
     generator = torch.Generator().manual_seed(seed)
+    options: dict[str, Any] = {}
+    if parts is not None and isinstance(upsampler, Surface | Patchwise):
+        options["keep"] = Parts(Path(parts) / _digest(network, sparse, count, upsampler))
     training = network.training
     network.eval()
     try:
         with torch.no_grad():
             raw = upsampler.upsample_cloud(
-                sparse.to(target), count, batch_size=batch_size, generator=generator, progress=progress
+                sparse.to(target), count, batch_size=batch_size, generator=generator, progress=progress, **options
             )
             dense = with_unit_normals(raw.cpu().double(), sparse)
     finally:
@@ -156,6 +166,16 @@ def _on_device(model: nn.Module | str | PathLike[str], device: str) -> tuple[nn.
     return network.to(target), target
 
 
+def _digest(network: nn.Module, sparse: Tensor, count: int, upsampler: object) -> str:
+    """Of all that the parts of a computation depend on."""
+    digest = hashlib.sha256(sparse.numpy().tobytes())
+    for name, value in network.state_dict().items():
+        digest.update(name.encode() + value.cpu().numpy().tobytes())
+    plain = {k: v for k, v in vars(upsampler).items() if isinstance(v, int | float | str)}
+    digest.update(repr((type(network).__name__, count, sorted(plain.items()), torch.__version__)).encode())
+    return digest.hexdigest()[:16]
+
+
 def _prepare(cloud: Cloud, progress: Progress) -> tuple[Tensor, Frame]:
     """Different points in a fixed order with normals, (n, 6) float64 in the unit sphere, and the way back."""
     points, normals = cloud.points, cloud.normals
@@ -193,15 +213,22 @@ class Patchwise:
         self.like = next(network.parameters(), torch.empty(0))  # tells device and type
 
     def upsample_cloud(
-        self, cloud: Tensor, count: int, *, batch_size: int | None, generator: torch.Generator, progress: Progress
+        self,
+        cloud: Tensor,
+        count: int,
+        *,
+        batch_size: int | None,
+        generator: torch.Generator,
+        progress: Progress,
+        keep: Keep = forget,
     ) -> Tensor:
         """cloud (n, 6) in the unit sphere -> (count, 3 or 6) on the CPU; nothing is random."""
         cloud = cloud.cpu()
         batch_size = 1 if self.like.device.type == "cpu" else batch_size or 64
         *before, last = self.pass_sizes(len(cloud), count)
         for size in before:
-            cloud = with_unit_normals(self._one_pass(cloud, size, batch_size, progress), cloud)
-        return self._one_pass(cloud, last, batch_size, progress)
+            cloud = with_unit_normals(self._one_pass(cloud, size, batch_size, progress, keep), cloud)
+        return self._one_pass(cloud, last, batch_size, progress, keep)
 
     def pass_sizes(self, n: int, count: int) -> list[int]:
         """Number of points after each pass from n to count: as few passes as possible, all with the same growth."""
@@ -214,7 +241,7 @@ class Patchwise:
             sizes.append(min(math.ceil(n * (count / n) ** (i / passes)), self.ratio * sizes[-1]))
         return [*sizes[1:], count]
 
-    def _one_pass(self, cloud: Tensor, count: int, batch_size: int, progress: Progress) -> Tensor:
+    def _one_pass(self, cloud: Tensor, count: int, batch_size: int, progress: Progress, keep: Keep) -> Tensor:
         """The network on patches of the cloud (n, 6), and farthest points of all it predicts: (count, 3 or 6)."""
         n, size = len(cloud), min(self.patch_size, len(cloud))
         centers = 1 if size == n else max(1, round(self.ratio * n / size))
@@ -222,11 +249,21 @@ class Patchwise:
         if size < SMALLEST_PATCH:
             idx = idx[:, torch.arange(SMALLEST_PATCH) % size]
         stage = f"network, {n} points"
-        predicted = []
+        done = 0
+
+        def predict(group: Tensor) -> Tensor:
+            dense = []
+            for patch in self._predict(cloud, group.split(batch_size)):
+                dense.append(patch.flatten(0, 1))
+                progress(stage, min(done + len(dense) * batch_size, len(idx)), len(idx))
+            return torch.cat(dense)
+
         progress(stage, 0, len(idx))
-        for dense in self._predict(cloud, idx.split(batch_size)):
-            predicted.append(dense.flatten(0, 1))
-            progress(stage, min(len(predicted) * batch_size, len(idx)), len(idx))
+        predicted = []
+        for group in idx.split(KEPT):
+            predicted.append(keep(f"{stage}, patch {done}", partial(predict, group)))
+            done += len(group)
+        progress(stage, done, len(idx))
         everything = _finite(torch.cat(predicted))
         stage = f"farthest points, {count} of {len(everything)}"
         progress(stage, 0, 1)

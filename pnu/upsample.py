@@ -3,6 +3,7 @@
 The module can be called, so that `pnu.upsample(points)` is `pnu.inference.upsample` whether or not it was imported.
 """
 
+import shutil
 import sys
 import time
 import types
@@ -13,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from pnu.run import command, doc
+
+LONG = 500_000  # points made, from which on finished parts are kept beside the output until it is there
 
 
 @dataclass
@@ -55,6 +58,10 @@ def upsample(cfg: Any) -> None:
     say(
         f"run:    {run}{'' if cfg.run else ' (the newest finished one)' if Path(run).is_dir() else ' (comes with pnu)'}"
     )
+    # a long one goes on, after an interruption, from the parts that are done
+    parts = Path(f"{cfg.output}.parts") if cfg.ratio * len(cloud.points) >= LONG else None
+    if parts is not None and parts.is_dir():
+        say(f"parts:  {parts}, of an earlier start; what fits is taken")
     with progress_bar(cfg.quiet) as progress:
         dense = inference.upsample(
             cloud.points,
@@ -66,9 +73,12 @@ def upsample(cfg: Any) -> None:
             batch_size=cfg.batch_size,
             seed=cfg.seed,
             progress=progress,
+            parts=parts,
         )
     attributes = inference.attributes(dense, cloud) if io.keeps_attributes(cfg.output) else {}
     io.write_cloud(cfg.output, dense[:, :3], dense[:, 3:], attributes)
+    if parts is not None:
+        shutil.rmtree(parts, ignore_errors=True)
     if cloud.attributes:
         say(f"        {'carried over' if attributes else 'left out'}: {', '.join(cloud.attributes)}")
     say(f"output: {cfg.output}, {len(dense)} points with unit normals, {time.perf_counter() - started:.1f} s")

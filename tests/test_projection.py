@@ -1,5 +1,7 @@
 """The surface model: local frames, seeds, even spacing, the projection as a whole."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
@@ -213,8 +215,8 @@ def test_most_doubtful_points_are_dropped() -> None:
     every = {}
     project = model.in_batches
 
-    def spy(query: Tensor, *rest: object) -> tuple[Tensor, Tensor]:
-        every["last"] = project(query, *rest)  # type: ignore[arg-type]
+    def spy(query: Tensor, cloud: Tensor, **options: Any) -> tuple[Tensor, Tensor]:
+        every["last"] = project(query, cloud, **options)
         return every["last"]
 
     model.in_batches = spy  # type: ignore[method-assign]

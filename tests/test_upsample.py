@@ -151,3 +151,24 @@ def test_help_names_every_key(tmp_path: Path) -> None:
     assert done.returncode == 0
     for key in ("input=", "output=", "run=", "ratio=4", "normals=auto", "device=auto", "quiet=false"):
         assert key in done.stdout
+
+
+def test_long_runs_keep_parts_until_the_output_is_there(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pnu import io
+    from pnu import upsample as module
+
+    monkeypatch.chdir(place)
+    monkeypatch.setattr(module, "LONG", 100)
+    parts = place / "dense.ply.parts"
+
+    def fail(*_: object) -> None:
+        raise ValueError("no space")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(io, "write_cloud", fail)
+        with pytest.raises(SystemExit):
+            module.main([*GOOD, "quiet=true", "run=surface"])
+    assert any(parts.rglob("*.npy"))
+    module.main([*GOOD, "quiet=true", "run=surface"])
+    assert len(read_cloud(place / "dense.ply").points) == 800
+    assert not parts.exists()

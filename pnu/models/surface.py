@@ -6,15 +6,18 @@ There are no patches, hence no borders; the cost grows with the output; any rati
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from pnu.ops import threads
 from pnu.ops.frames import FEATURES, local_frames
 from pnu.ops.grouping import gather
 from pnu.ops.nearest import knn
 from pnu.ops.noise import noise_level
+from pnu.ops.parts import Keep, forget
 from pnu.ops.sampling import farthest_points, farthest_points_large
 from pnu.ops.spacing import spacing
 from pnu.ops.spread import repel, tangent_discs
@@ -177,44 +180,67 @@ class Surface(nn.Module):
         batch_size: int | None = None,
         generator: torch.Generator | None = None,
         progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+        keep: Keep = forget,
     ) -> Tensor:
         """cloud (n, 6) -> (count, 6) with unit normals. Nothing is random; batch_size: queries at once.
 
         The points of a cloud that is noisy beside their spacing are themselves projected first.
         """
+        run = partial(self.in_batches, batch_size=batch_size, progress=progress, keep=keep)
         if noise_in_spacings(cloud) > SMOOTH:
-            cloud, _ = self.in_batches(cloud, cloud, batch_size, progress, "smoothing, the points are noisy")
+            cloud, _ = run(cloud, cloud, stage="smoothing, the points are noisy")
         each = max(1, round(self.seeds * count / len(cloud)))
-        query = seeds_around(cloud, each, round(self.candidates * count))
-        query, error = self.in_batches(query, cloud, batch_size, progress, "projection")
-        query = thin(query, round((1 + self.reject) * count))
+        query = keep("seeds", lambda: seeds_around(cloud, each, round(self.candidates * count))).to(cloud)
+        query, error = run(query, cloud, stage="projection")
+        query = keep("thinned", partial(thin, query, round((1 + self.reject) * count))).to(cloud)
         if self.relaxation:
-            query = torch.cat([repel(query[:, :3], query[:, 3:], steps=self.relaxation), query[:, 3:]], 1)
+            query = keep("even", partial(evened, query, self.relaxation)).to(cloud)
         for i in range(self.refinements):
-            query, error = self.in_batches(query, cloud, batch_size, progress, f"refinement {i + 1}")
+            query, error = run(query, cloud, stage=f"refinement {i + 1}")
         return query[error.argsort(stable=True)[:count].sort().values]
 
     def in_batches(
         self,
         query: Tensor,
         cloud: Tensor,
+        *,
         batch_size: int | None,
         progress: Callable[[str, int, int], None],
+        keep: Keep,
         stage: str,
     ) -> tuple[Tensor, Tensor]:
-        """query (m, 6) -> projected (m, 6) and logarithm of the expected error (m,)."""
-        size = batch_size or (512 if cloud.device.type == "cpu" else 2**16)
-        parts = []
-        for first in range(0, len(query), SEARCHED):
+        """query (m, 6) -> projected (m, 6) and logarithm of the expected error (m,).
+
+        On the CPU each thread works on batches of its own, so the result does not depend on their number.
+        """
+        on_cpu = cloud.device.type == "cpu"
+        size = batch_size or (512 if on_cpu else 2**16)
+        together = 2 * torch.get_num_threads() if on_cpu else 1
+
+        def piece(first: int) -> Tensor:
             searched = query[None, first : first + SEARCHED]
             idx = self.neighbors(searched, cloud[None])
-            for start in range(0, searched.shape[1], size):
-                progress(stage, first + start, len(query))
-                part = slice(start, start + size)
+
+            def project(part: slice) -> Tensor:
                 projected, log_error, spacing = self.project(searched[:, part], cloud[None], idx[:, part])
-                parts.append((projected[0], log_error[0] + spacing[0].log()))
+                return torch.cat([projected[0], (log_error[0] + spacing[0].log()).to(projected)[:, None]], 1)
+
+            batches = [slice(start, start + size) for start in range(0, searched.shape[1], size)]
+            parts: list[Tensor] = []
+            while len(parts) < len(batches):
+                progress(stage, first + len(parts) * size, len(query))
+                now = batches[len(parts) : len(parts) + together]
+                parts += threads.spread(project, now) if on_cpu else [project(now[0])]
+            return torch.cat(parts)
+
+        progress(stage, 0, len(query))
+        found = [
+            keep(f"{stage}, {first} of {len(query)}", partial(piece, first)).to(cloud)
+            for first in range(0, len(query), SEARCHED)
+        ]
         progress(stage, len(query), len(query))
-        return torch.cat([p for p, _ in parts]), torch.cat([e for _, e in parts])
+        everything = torch.cat(found)
+        return everything[:, :6], everything[:, 6]
 
 
 def noise_in_spacings(cloud: Tensor) -> float:
@@ -233,6 +259,11 @@ def seeds_around(cloud: Tensor, each: int, count: int) -> Tensor:
         kept = torch.from_numpy(farthest_points_large(places, count)).to(cloud.device)
     owner = torch.where(kept < len(cloud), kept, (kept - len(cloud)) // each)
     return torch.cat([places[kept], cloud[owner, 3:]], 1)
+
+
+def evened(cloud: Tensor, steps: int) -> Tensor:
+    """A cloud (m, 6) with points moved to an even spacing."""
+    return torch.cat([repel(cloud[:, :3], cloud[:, 3:], steps=steps), cloud[:, 3:]], 1)
 
 
 def thin(cloud: Tensor, count: int) -> Tensor:
