@@ -1,6 +1,7 @@
 """Formats: what is written is read again, foreign variants are understood, bad files are refused in one line."""
 
 import struct
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +52,7 @@ def test_cloud_round_trip(tmp_path: Path, cloud: tuple[Array, Array], suffix: st
     path = tmp_path / f"cloud{suffix}"
     write_cloud(path, points, normals if with_normals else None)
     read = read_cloud(path)
-    np.testing.assert_allclose(read.points, points, rtol=1e-14, atol=1e-6 if suffix == ".pcd" else 0)
+    np.testing.assert_allclose(read.points, points, rtol=1e-14, atol=1e-6 if suffix in (".pcd", ".las", ".laz") else 0)
     assert (read.normals is not None) == with_normals
     if with_normals:
         np.testing.assert_allclose(read.normals, normals, atol=1e-7)
@@ -75,6 +76,36 @@ def test_single_precision_is_used_where_it_is_exact(tmp_path: Path, cloud: tuple
     assert b"property double x" in (tmp_path / "double.ply").read_bytes()
     np.testing.assert_array_equal(read_cloud(tmp_path / "single.ply").points, single)
     np.testing.assert_array_equal(read_cloud(tmp_path / "double.ply").points, cloud[0])
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_lidar_files_in_slices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
+    """Colours, lidar's own scalars and others; laspy reads the same; a missing laspy is named with its cure."""
+    import laspy
+
+    monkeypatch.setattr("pnu.io.las.SLICE", 7)
+    rng = np.random.default_rng(1)
+    points = rng.normal(size=(40, 3)) + [5e5, 5e6, 100]
+    attributes = {
+        "colors": rng.integers(0, 256, (40, 3), dtype=np.uint8),
+        "intensity": rng.random(40).astype(np.float32),  # no whole numbers, as las wants them
+        "classification": rng.integers(0, 9, 40, dtype=np.uint8),
+        "label": rng.integers(-5, 5, 40, dtype=np.int16),
+    }
+    path = tmp_path / f"c{suffix}"
+    write_cloud(path, points, points - points.mean(0), attributes)
+    read = read_cloud(path)
+    assert np.abs(read.points - points).max() < 1e-8
+    assert read.normals is not None
+    assert read.attributes.keys() == attributes.keys()
+    for name, values in attributes.items():
+        np.testing.assert_array_equal(read.attributes[name], values)
+    foreign = laspy.read(path)
+    np.testing.assert_allclose(foreign.xyz, points, atol=1e-8)
+    np.testing.assert_array_equal(foreign.classification, attributes["classification"])
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    with pytest.raises(ValueError, match=r"laspy, which is not installed: pip install 'pnu\[las\]'"):
+        read_cloud(path)
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd"])

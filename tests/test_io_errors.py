@@ -26,7 +26,7 @@ ROWS = "\n".join(f"{i} {i % 4} {i % 5}" for i in range(20))
 SIX = "\n".join(f"{i} {i % 4} {i % 5} 0 0 1" for i in range(20))
 BAD_CLOUDS = {
     "empty.xyz": (b"", "the file is empty; expected a point cloud"),
-    "suffix.foo": (b"1", r"suffix '.foo' is not a format of a point cloud; use one of .npy .obj .off .pcd .ply .txt"),
+    "suffix.foo": (b"1", r"suffix '.foo' is not a format of a point cloud; use one of .las .laz .npy .obj .off"),
     "plain": (b"1", "no suffix is not a format of a point cloud"),
     "words.xyz": (ROWS.replace("7 3 2", "seven 3 2").encode(), "line 8: expected numbers, found 'seven'"),
     "header.txt": (f"x,y,z\n{ROWS}".encode(), "line 1: expected numbers, found 'x'; remove or comment"),
@@ -197,8 +197,8 @@ def test_damaged_bytes_never_crash(tmp_path: Path, cloud: tuple[Array, Array], s
 def test_bad_output(tmp_path: Path, cloud: tuple[Array, Array]) -> None:
     with pytest.raises(ValueError, match=r"the folder .*nowhere does not exist; create it first"):
         check_output(tmp_path / "nowhere" / "c.ply")
-    with pytest.raises(ValueError, match=r"the suffix '.las' is not a format of a point cloud"):
-        write_cloud(tmp_path / "c.las", *cloud)
+    with pytest.raises(ValueError, match=r"the suffix '.e57' is not a format of a point cloud"):
+        write_cloud(tmp_path / "c.e57", *cloud)
     (tmp_path / "folder.ply").mkdir()
     with pytest.raises(ValueError, match="is a folder; give the name of a file to write"):
         write_cloud(tmp_path / "folder.ply", *cloud)

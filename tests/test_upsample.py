@@ -83,8 +83,8 @@ BAD = {
     "no file": (("input=no.ply", "output=dense.ply"), "no.ply: no such file; give the path of a point cloud"),
     "empty": (("input=empty.ply", "output=dense.ply"), "empty.ply: the file is empty; expected a point cloud"),
     "suffix": (
-        ("input=cloud.ply", "output=dense.las"),
-        "dense.las: the suffix '.las' is not a format of a point cloud",
+        ("input=cloud.ply", "output=dense.e57"),
+        "dense.e57: the suffix '.e57' is not a format of a point cloud",
     ),
     "folder": (("input=cloud.ply", "output=no/dense.ply"), "no/dense.ply: the folder no does not exist; create it"),
     "columns": (("input=five.txt", "output=dense.ply"), "five.txt: has 5 columns; expected 3 (x y z) or 6"),

@@ -1,4 +1,4 @@
-"""Point clouds: ply, xyz, txt, pcd, obj, off, npy."""
+"""Point clouds: ply, xyz, txt, pcd, obj, off, npy, las, laz."""
 
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pnu.io.atomic import atomic_path, check_writable
+from pnu.io.las import read_las, write_las
 from pnu.io.mesh import Geometry, as_colors, ply_normals, read_obj, read_off, write_obj, write_off, xyz_columns
 from pnu.io.pcd import read_pcd, write_pcd
 from pnu.io.ply import read_ply, write_ply
@@ -92,9 +93,9 @@ def write_cloud(
 ) -> None:
     """Write points (n, 3), normals (n, 3) and attributes (n,) or (n, k) atomically, in the format of the suffix.
 
-    ply and pcd are binary and keep attributes (see `keeps_attributes`); the other formats do not. Coordinates are
+    ply, pcd, las and laz are binary and keep attributes (see `keeps_attributes`); the others do not. Coordinates are
     float64 in npy, which is an array (n, 3) or (n, 6); float32 in ply where that is exact, in pcd where it is good to
-    a millionth of the extent, and float64 otherwise.
+    a millionth of the extent, billionths of the extent in las and laz, and float64 otherwise.
     """
     path = Path(path)
     suffix = known_suffix(path, "point cloud", CLOUD_SUFFIXES)
@@ -115,7 +116,7 @@ def check_output(path: str | Path) -> None:
 
 def keeps_attributes(path: str | Path) -> bool:
     """Whether the format of this suffix holds colours and scalars beside points and normals."""
-    return Path(path).suffix.lower() in NORMAL_FIELDS
+    return Path(path).suffix.lower() in {*NORMAL_FIELDS, ".las", ".laz"}
 
 
 def _read_text(path: Path) -> Cloud:
@@ -191,6 +192,17 @@ def _from_columns(path: Path, columns: dict[str, np.ndarray], normal: tuple[str,
     if colors is not None:
         columns["colors"] = colors if colors.dtype == np.uint8 else as_colors(colors)
     return Cloud(points.astype(np.float64), normals, columns)
+
+
+def _read_las(path: Path) -> Cloud:
+    return Cloud(*read_las(path))
+
+
+def _write_las(path: Path, cloud: Cloud) -> None:
+    attributes = _storable(cloud.attributes)
+    if "colors" in attributes and attributes["colors"].dtype != np.uint8:
+        attributes["colors"] = as_colors(attributes["colors"])
+    write_las(path, cloud.points, cloud.normals, attributes)
 
 
 def _from_geometry(read: Callable[[Path], Geometry]) -> Callable[[Path], Cloud]:
@@ -275,6 +287,8 @@ READERS: dict[str, Callable[[Path], Cloud]] = {
     ".obj": _from_geometry(read_obj),
     ".off": _from_geometry(read_off),
     ".npy": _read_npy,
+    ".las": _read_las,
+    ".laz": _read_las,
 }
 WRITERS: dict[str, Callable[[Path, Cloud], None]] = {
     ".ply": _write_ply,
@@ -284,5 +298,7 @@ WRITERS: dict[str, Callable[[Path, Cloud], None]] = {
     ".obj": _write_geometry(write_obj),
     ".off": _write_geometry(write_off),
     ".npy": _write_npy,
+    ".las": _write_las,
+    ".laz": _write_las,
 }
 CLOUD_SUFFIXES = frozenset(READERS)

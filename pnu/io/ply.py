@@ -1,5 +1,6 @@
 """The Stanford format: any elements and properties, in text or binary of either byte order."""
 
+import mmap
 import struct
 from collections.abc import Mapping
 from itertools import islice
@@ -15,6 +16,7 @@ TYPES = {
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"},
     **{"double": "f8", "float64": "f8", "int64": "i8", "uint64": "u8"},
 }
+SLICE = 2**20  # rows written at once
 NAMES = {
     **{"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"},
     **{"f4": "float", "f8": "double"},
@@ -47,7 +49,8 @@ Columns = dict[str, np.ndarray | Lists]
 
 def read_ply(path: Path, wanted: set[str]) -> dict[str, Columns]:
     """Columns of the wanted elements by property name. Counts that the file's size cannot hold are refused unread."""
-    data = path.read_bytes()
+    with path.open("rb") as handle:
+        data = mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ)  # pages come in as they are needed
     order, elements, start = _header(path, data)
     found: dict[str, Columns] = {}
     if order is None:
@@ -65,10 +68,10 @@ def read_ply(path: Path, wanted: set[str]) -> dict[str, Columns]:
     return found
 
 
-def _header(path: Path, data: bytes) -> tuple[str | None, list[Element], int]:
+def _header(path: Path, data: mmap.mmap) -> tuple[str | None, list[Element], int]:
     """Byte order ("<", ">", None for text), elements, and where the body starts."""
     end = data.find(b"end_header")
-    if not data.startswith(b"ply") or end < 0:
+    if data[:3] != b"ply" or end < 0:
         raise ValueError(f"{path}: expected a ply header from 'ply' to 'end_header', found none; is it another format?")
     order: str | None = ""
     elements: list[Element] = []
@@ -144,7 +147,7 @@ def _text(path: Path, element: Element, lines: list[str]) -> Columns:
     return result
 
 
-def _binary(path: Path, data: bytes, start: int, element: Element, order: str) -> tuple[Columns, int]:
+def _binary(path: Path, data: mmap.mmap, start: int, element: Element, order: str) -> tuple[Columns, int]:
     """Columns of an element that begins at byte `start`, and where it ends."""
     least = sum(np.dtype(item.length or item.type).itemsize for item in element.properties)
     if element.size * least > len(data) - start:
@@ -163,7 +166,7 @@ def _binary(path: Path, data: bytes, start: int, element: Element, order: str) -
     return _ragged(path, data, start, element, order)
 
 
-def _row_lengths(data: bytes, start: int, element: Element, order: str) -> tuple[dict[str, int], int]:
+def _row_lengths(data: mmap.mmap, start: int, element: Element, order: str) -> tuple[dict[str, int], int]:
     """Length of each list in the row at byte `start`, and where the row ends; `struct.error` where it is cut off."""
     lengths: dict[str, int] = {}
     for item in element.properties:
@@ -203,7 +206,7 @@ def _columns(element: Element, rows: np.ndarray, lengths: Mapping[str, int]) -> 
     return result
 
 
-def _ragged(path: Path, data: bytes, start: int, element: Element, order: str) -> tuple[Columns, int]:
+def _ragged(path: Path, data: mmap.mmap, start: int, element: Element, order: str) -> tuple[Columns, int]:
     """Rows whose lists differ in length, one after the other."""
     rows: list[Columns] = []
     for number in range(element.size):
@@ -227,16 +230,18 @@ def _ragged(path: Path, data: bytes, start: int, element: Element, order: str) -
 def write_ply(path: Path, vertex: Mapping[str, np.ndarray], faces: np.ndarray | None = None) -> None:
     """Binary little-endian ply of vertex properties (n,) and, if given, triangles (f, 3)."""
     dtype = np.dtype([(name, values.dtype.newbyteorder("<")) for name, values in vertex.items()])
-    rows = np.empty(len(next(iter(vertex.values()))), dtype)
-    for name, values in vertex.items():
-        rows[name] = values
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    n = len(next(iter(vertex.values())))
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
     header += [f"property {NAMES[values.dtype.str[1:]]} {name}" for name, values in vertex.items()]
     if faces is not None:
         header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
     with path.open("wb") as handle:
         handle.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii", "replace"))
-        rows.tofile(handle)
+        for start in range(0, n, SLICE):
+            rows = np.empty(min(SLICE, n - start), dtype)
+            for name, values in vertex.items():
+                rows[name] = values[start : start + SLICE]
+            rows.tofile(handle)
         if faces is not None:
             triangles = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", (3,))])
             triangles["count"], triangles["corners"] = 3, faces

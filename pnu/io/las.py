@@ -1,0 +1,119 @@
+"""Lidar exchange format, las and compressed laz, a slice at a time; needs laspy: pip install 'pnu[las]'."""
+
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+SLICE = 2**20  # points
+MOST = 100  # points that a byte of laz may hold: bounds what a damaged header makes us allocate
+NORMAL = ("nx", "ny", "nz")  # extra dimensions
+CARRIED = ("intensity", "classification", "gps_time")
+FOREIGN = "pnu "  # before the name of a scalar that las has, but not with such values
+COLORS = ("red", "green", "blue")
+Content = tuple[np.ndarray, np.ndarray | None, dict[str, np.ndarray]]
+
+
+def _laspy(path: Path) -> ModuleType:
+    try:
+        import laspy
+    except ImportError:
+        raise ValueError(f"{path}: las and laz need laspy, which is not installed: pip install 'pnu[las]'") from None
+    return laspy
+
+
+def read_las(path: Path) -> Content:
+    """Points (n, 3) float64, normals if there are, and colours, intensity, classification, time and extra scalars."""
+    laspy = _laspy(path)
+    try:
+        _check_counts(path)
+        with laspy.open(path) as file:
+            if file.header.point_count > MOST * path.stat().st_size:
+                raise ValueError(f"its header promises {file.header.point_count} points, more than it has room for")
+            return _content(file)
+    except Exception as error:  # laspy and its decompressors know many kinds
+        reason = (str(error).splitlines() or [""])[0][:80]
+        raise ValueError(f"{path}: is no las file that can be read ({reason}); export it again") from None
+
+
+def _check_counts(path: Path) -> None:
+    """`ValueError` where the header counts more records than the file has room for: laspy would read on for hours."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(375)
+    if head[:4] != b"LASF" or len(head) < 227:
+        raise ValueError("it does not begin with a las header")
+    records = 54 * struct.unpack_from("<I", head, 100)[0]
+    if head[24:26] == b"\x01\x04" and len(head) == 375:
+        records += 60 * struct.unpack_from("<I", head, 243)[0]
+    if records > size:
+        raise ValueError("its header counts more records than it has room for")
+
+
+def _content(file) -> Content:  # type: ignore[no-untyped-def]
+    n = file.header.point_count
+    known = set(file.header.point_format.dimension_names)
+    extra = [name for name in file.header.point_format.extra_dimension_names if name not in NORMAL]
+    points = np.empty((n, 3))
+    normals = np.empty((n, 3)) if known.issuperset(NORMAL) else None
+    colors = np.empty((n, 3), np.uint16) if known.issuperset(COLORS) else None
+    columns: dict[str, np.ndarray] = {}
+    done = 0
+    for chunk in file.chunk_iterator(SLICE):
+        part = slice(done, done + len(chunk))
+        points[part] = np.stack([chunk.x, chunk.y, chunk.z], 1)
+        if normals is not None:
+            normals[part] = np.stack([chunk[name] for name in NORMAL], 1)
+        if colors is not None:
+            colors[part] = np.stack([chunk[name] for name in COLORS], 1)
+        for name in [*(name for name in CARRIED if name in known and FOREIGN + name not in known), *extra]:
+            values = np.asarray(chunk[name])
+            if name not in columns:
+                columns[name] = np.zeros((n, *values.shape[1:]), values.dtype)
+            columns[name][part] = values
+        done += len(chunk)
+    if done < n:
+        raise ValueError(f"the header promises {n} points, the file holds {done}")
+    attributes = {name.removeprefix(FOREIGN): v for name, v in columns.items() if name in extra or v.any()}
+    if colors is not None and colors.any():
+        attributes["colors"] = (colors if colors.max() < 256 else colors >> 8).astype(np.uint8)
+    return points, normals, attributes
+
+
+def write_las(path: Path, points: np.ndarray, normals: np.ndarray | None, attributes: Mapping[str, np.ndarray]) -> None:
+    """Coordinates to a billionth of the extent; normals and scalars that las does not know as extra dimensions."""
+    laspy = _laspy(path)
+    header = laspy.LasHeader(version="1.4", point_format=7 if "colors" in attributes else 6)
+    header.offsets = np.floor(points.min(0))
+    extent = max(float((points.max(0) - header.offsets).max()), 1e-9)
+    header.scales = np.full(3, 10 ** np.ceil(np.log10(extent / 2**31 * 1.001)))
+    known = {dimension.name: dimension for dimension in header.point_format.dimensions}
+    columns = {}
+    for name, values in attributes.items():
+        if name != "colors":
+            exact = name not in known or (
+                values.ndim == 1 and np.array_equal(values.astype(known[name].dtype or np.uint8), values)
+            )
+            columns[name if exact else FOREIGN + name] = values
+    if normals is not None:
+        columns |= dict(zip(NORMAL, normals.astype(np.float32).T, strict=True))
+    header.add_extra_dims(
+        [
+            laspy.ExtraBytesParams(name=name[:32], type=f"{values.shape[1] if values.ndim > 1 else ''}{values.dtype}")
+            for name, values in columns.items()
+            if name not in known
+        ]
+    )
+    with laspy.open(path, mode="w", header=header, do_compress=path.suffix.lower() == ".laz") as file:
+        for start in range(0, len(points), SLICE):
+            part = slice(start, start + SLICE)
+            record = laspy.ScaleAwarePointRecord.zeros(len(points[part]), header=header)
+            record.x, record.y, record.z = points[part].T
+            for name, values in columns.items():
+                record[name[:32]] = values[part]
+            if "colors" in attributes:
+                for name, values in zip(COLORS, attributes["colors"][part].T, strict=False):
+                    record[name] = values.astype(np.uint16) * 257
+            file.write_points(record)
