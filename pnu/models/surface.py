@@ -215,7 +215,7 @@ class Surface(nn.Module):
         """
         on_cpu = cloud.device.type == "cpu"
         size = batch_size or (512 if on_cpu else 2**16)
-        together = 2 * torch.get_num_threads() if on_cpu else 1
+        together = 16 * torch.get_num_threads() if on_cpu else 1
 
         def piece(first: int) -> Tensor:
             searched = query[None, first : first + SEARCHED]
