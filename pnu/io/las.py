@@ -106,14 +106,17 @@ def write_las(path: Path, points: np.ndarray, normals: np.ndarray | None, attrib
             if name not in known
         ]
     )
-    with laspy.open(path, mode="w", header=header, do_compress=path.suffix.lower() == ".laz") as file:
-        for start in range(0, len(points), SLICE):
-            part = slice(start, start + SLICE)
-            record = laspy.ScaleAwarePointRecord.zeros(len(points[part]), header=header)
-            record.x, record.y, record.z = points[part].T
-            for name, values in columns.items():
-                record[name[:32]] = values[part]
-            if "colors" in attributes:
-                for name, values in zip(COLORS, attributes["colors"][part].T, strict=False):
-                    record[name] = values.astype(np.uint16) * 257
-            file.write_points(record)
+    try:
+        with laspy.open(path, mode="w", header=header, do_compress=path.suffix.lower() == ".laz") as file:
+            for start in range(0, len(points), SLICE):
+                part = slice(start, start + SLICE)
+                record = laspy.ScaleAwarePointRecord.zeros(len(points[part]), header=header)
+                record.x, record.y, record.z = points[part].T
+                for name, values in columns.items():
+                    record[name[:32]] = values[part]
+                if "colors" in attributes:
+                    for name, values in zip(COLORS, attributes["colors"][part].T, strict=False):
+                        record[name] = values.astype(np.uint16) * 257
+                file.write_points(record)
+    except RuntimeError as error:  # of the compressor, where the disk is full
+        raise OSError(str(error)) from error
