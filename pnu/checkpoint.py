@@ -36,8 +36,10 @@ def load(source: str | PathLike[str]) -> nn.Module:
         ValueError: no run folder, or its config or checkpoint are not those of a network of ours.
     """
     if (file := weights.find(source)) is not None:
-        model, tensors = weights.read(file)
+        model, points, tensors = weights.read(file)
         network = models.build(model)
+        if points is not None:
+            network.patch_size = points  # type: ignore[assignment]
         fill(network, tensors, file)
         return network.eval()
     folder = Path(source)

@@ -25,7 +25,8 @@ def export(cfg: Any) -> None:
     from pnu import checkpoint, weights
 
     network = checkpoint.load(cfg.run)
-    weights.write(cfg.output, checkpoint.run_config(Path(cfg.run))["model"], network.state_dict())
+    model = checkpoint.run_config(Path(cfg.run))["model"]
+    weights.write(cfg.output, model, network.state_dict(), getattr(network, "patch_size", None))
     if not cfg.quiet:
         print(f"output: {cfg.output}, {Path(cfg.output).stat().st_size / 1e6:.2f} MB")
         print(f"next:   python -m pnu.upsample run={cfg.output} input=cloud.ply output=dense.ply")

@@ -51,6 +51,16 @@ def test_bad_export(place: Path, capsys: pytest.CaptureFixture[str], arguments: 
     assert text in line
 
 
+def test_points_of_a_patch_are_kept(place: Path) -> None:
+    config = Path("run/config.yaml")
+    config.write_text(config.read_text() + "data: {input_points: 64}\n")
+    main(["run=run", "output=small.safetensors", "quiet=true"])
+    assert pnu.load("small.safetensors").patch_size == 64
+    weights.write("odd.safetensors", MODEL, {}, -1)
+    with pytest.raises(ValueError, match=r"odd\.safetensors: expected a whole number of points as patch_size"):
+        pnu.load("odd.safetensors")
+
+
 def test_broken_and_foreign_files_are_refused(place: Path) -> None:
     Path("broken.safetensors").write_bytes(b"nothing of the kind")
     with pytest.raises(ValueError, match=r"broken\.safetensors: expected weights as safetensors"):

@@ -4,12 +4,20 @@ import json
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
 FOLDER = Path(__file__).parent
 SUFFIX = ".safetensors"
+
+
+class Weights(NamedTuple):
+    """A trained network."""
+
+    model: dict[str, Any]  # what `models.build` takes
+    patch_size: int | None  # points of the patches that it was trained on; None: the network's default
+    state: dict[str, Tensor]
 
 
 def names() -> list[str]:
@@ -25,8 +33,8 @@ def find(source: str | PathLike[str]) -> Path | None:
     return path if path.suffix == SUFFIX and path.is_file() else None
 
 
-def read(path: str | PathLike[str]) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """The network's config (what `models.build` takes) and its state.
+def read(path: str | PathLike[str]) -> Weights:
+    """The network that a file holds.
 
     Raises:
         ValueError: the file is broken, or not one that `write` made.
@@ -35,21 +43,27 @@ def read(path: str | PathLike[str]) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
     try:
         with safe_open(path, "pt") as file:
-            config = json.loads((file.metadata() or {}).get("model", "null"))
+            metadata = file.metadata() or {}
+            config, patch_size = (json.loads(metadata.get(name, "null")) for name in ("model", "patch_size"))
             state = {name: file.get_tensor(name) for name in sorted(file.keys())}
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: expected weights as safetensors, found {' '.join(str(error).split())}") from error
     if not isinstance(config, dict):
         raise ValueError(f"{path}: expected weights written by pnu.export, found no network's config in their metadata")
-    return config, state
+    if patch_size is not None and not (type(patch_size) is int and patch_size > 0):
+        raise ValueError(f"{path}: expected a whole number of points as patch_size in the metadata, found {patch_size}")
+    return Weights(config, patch_size, state)
 
 
-def write(path: str | PathLike[str], config: Mapping[str, Any], state: Mapping[str, Tensor]) -> None:
-    """Write a network's config and state, atomically."""
+def write(
+    path: str | PathLike[str], model: Mapping[str, Any], state: Mapping[str, Tensor], patch_size: int | None = None
+) -> None:
+    """Write a network, atomically."""
     from safetensors.torch import save
 
     from pnu.io import atomic_path
 
     with atomic_path(Path(path)) as temporary:
-        content = save({k: v.contiguous() for k, v in state.items()}, {"model": json.dumps(dict(config))})
+        metadata = {"model": json.dumps(dict(model)), "patch_size": json.dumps(patch_size)}
+        content = save({k: v.contiguous() for k, v in state.items()}, metadata)
         temporary.write_bytes(content)
