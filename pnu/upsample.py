@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from pnu.run import command, doc
 
@@ -20,11 +20,14 @@ LONG = 500_000  # points made, from which on finished parts are kept beside the 
 
 @dataclass
 class Upsample:
-    """Densify a point cloud file with a trained network."""
+    """Densify a point cloud file with a trained network; `model=NAME` is `run=NAME`."""
 
+    also: ClassVar = {"model": "run"}
     input: str = doc("file to read: ply, xyz, txt, pcd, obj, off or npy")
     output: str = doc("file to write; its suffix says the format")
-    run: str | None = doc("run folder, or weights that come with pnu: surface ...; null: the newest run, or surface")
+    run: str | None = doc(
+        "run folder, or weights that come with pnu: surface, pnu ...; null: the newest run, or surface"
+    )
     ratio: float = doc("points out for each point in, any number >= 1")
     normals: str = doc("auto: the file's, estimated where it has none; estimate: always estimated")
     patch_size: int | None = doc("points of a patch; null: what the network was made for")
@@ -55,9 +58,8 @@ def upsample(cfg: Any) -> None:
 
     say(f"        {survey(cloud.points, cloud.normals)}")
     run = inference.source(cfg.run, cloud.normals)
-    say(
-        f"run:    {run}{'' if cfg.run else ' (the newest finished one)' if Path(run).is_dir() else ' (comes with pnu)'}"
-    )
+    chosen = "" if cfg.run else " (the newest finished one)" if Path(run).is_dir() else " (comes with pnu)"
+    say(f"run:    {run}{chosen}")
     # a long one goes on, after an interruption, from the parts that are done
     parts = Path(f"{cfg.output}.parts") if cfg.ratio * len(cloud.points) >= LONG else None
     if parts is not None and parts.is_dir():

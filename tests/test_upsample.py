@@ -78,6 +78,15 @@ def test_given_run_quiet_and_estimated_normals(place: Path) -> None:
     assert len(read_cloud(place / "c.pcd").points) == 200
 
 
+def test_weights_by_name(place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    from pnu.upsample import main
+
+    monkeypatch.chdir(place)
+    main([*GOOD, "model=surface"])  # not the run in outputs/
+    assert "run:    surface\n" in capsys.readouterr().out
+    assert len(read_cloud(place / "dense.ply").points) == 800
+
+
 GOOD = ("input=cloud.ply", "output=dense.ply")
 BAD = {
     "no file": (("input=no.ply", "output=dense.ply"), "no.ply: no such file; give the path of a point cloud"),
@@ -98,6 +107,7 @@ BAD = {
     "missing": (("input=cloud.ply",), "output=... is required"),
     "no run": ((*GOOD, "run=nowhere"), "run=nowhere: expected a run folder, such as outputs/<date>/<time>_<name>"),
     "not a run": ((*GOOD, "run=outputs"), "run=outputs: expected a run folder with"),
+    "no model": ((*GOOD, "model=nowhere"), "run=nowhere: expected a run folder, such as"),
     "device": ((*GOOD, "device=tpu"), "device=tpu: is not here; expected auto, cpu, or cuda"),
 }
 

@@ -4,7 +4,7 @@ import functools
 import os
 import sys
 import typing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
 
     Args:
         function: gets the checked config; its `ValueError`s and `OSError`s become one line and exit code 2.
-        schema: dataclass that documents every key of `conf/<name>.yaml`.
+        schema: dataclass that documents every key of `conf/<name>.yaml`; `also` of it: other names of keys.
         name: of the config file; default: the schema's name in lower case.
     """
     name = name or schema.__name__.lower()
@@ -39,7 +39,10 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
 
     def main(argv: Sequence[str] | None = None) -> None:
         # Hydra reads options only before the first override: `a=1 -m b=2` is as good as `-m a=1 b=2`
-        arguments = sorted(sys.argv[1:] if argv is None else argv, key=is_override)
+        given = [
+            renamed(argument, getattr(schema, "also", {})) for argument in (sys.argv[1:] if argv is None else argv)
+        ]
+        arguments = sorted(given, key=is_override)
         # before torch is there: on a busy machine, threads that spin while they wait make a step take seconds
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         program = f"python -m pnu.{name}" if sys.argv[0].endswith(".py") else Path(sys.argv[0]).name
@@ -91,6 +94,11 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
 
 def is_override(argument: str) -> bool:
     return not argument.startswith("-") and ("=" in argument or argument.startswith("~"))
+
+
+def renamed(argument: str, names: Mapping[str, str]) -> str:
+    key, equals, value = argument.partition("=")
+    return f"{names.get(key, key)}{equals}{value}"
 
 
 def stop(error: Exception) -> typing.NoReturn:
