@@ -3,7 +3,7 @@
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from pnu.run import command, doc
 from pnu.run.groups import Data
@@ -15,8 +15,9 @@ SETTINGS = ("ratio", "points", "truth_points", "normals", "search", "passes", "s
 
 @dataclass
 class Evaluate:
-    """Upsample whole clouds of several kinds, measure the results against the true surfaces, and write tables."""
+    """Upsample whole clouds of several kinds and measure them against the truth: tables. `model=NAME` is `run=NAME`."""
 
+    also: ClassVar = {"model": "run"}
     run: str | None = doc(
         "run folder, or name or file of weights; null: the newest finished run under outputs/, or `method`"
     )

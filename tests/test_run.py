@@ -418,3 +418,9 @@ def test_metrics_are_put_together(tmp_path: Path) -> None:
     run.add_metrics("test", [{"test/chamfer_sq": 1.0}, {"test/flipped": 0.5}])
     content = json.loads(run.metrics.read_text())
     assert content == {"untrained": {"chamfer_sq": 2.0}, "test": {"chamfer_sq": 1.0, "flipped": 0.5}}
+
+
+def test_a_reader_that_goes_is_no_error() -> None:
+    command = f"{sys.executable} -m pnu.upsample --help | true"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stderr == ""

@@ -102,6 +102,9 @@ def renamed(argument: str, names: Mapping[str, str]) -> str:
 
 
 def stop(error: Exception) -> typing.NoReturn:
+    if isinstance(error, BrokenPipeError):  # the reader of the output has gone, as in `... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     print(f"error: {one_line(error)}", file=sys.stderr)
     sys.exit(2)
 
