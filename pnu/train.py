@@ -35,7 +35,7 @@ def train(cfg: Any) -> list[float] | None:
     run, config = open_run(cfg, Train)
     if run.skip:
         run.unlock()
-        print(f"{run}: has finished before, skipped")
+        print(f"{run}: {run.skip}")
         return objective(config, run)
     with run.recorded(config) as record:
         import lightning.pytorch as pl  # seconds: only once the config is known to be good

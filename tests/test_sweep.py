@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from pnu.io import read_json, write_json
 from pnu.run import compose_config
 from pnu.run.config import composer, config_folder
 from pnu.run.schema import check
@@ -260,13 +261,16 @@ def test_a_job_that_runs_is_left_alone(
     folder = tmp_path / "outputs" / "sweeps" / "s"
     run = next(folder.glob("seed=0*"))
     before = (run / "metrics.json").stat().st_mtime_ns
+    write_json(run / "run.json", read_json(run / "run.json") | {"status": "running"})
+    capsys.readouterr()
     descriptor = locked(run)
-    with pytest.raises(SystemExit):
-        main(line)
+    main(line)
     os.close(descriptor)
     captured = capsys.readouterr()
-    assert "another process runs this job" in captured.err
+    assert captured.err == ""
+    assert f"{run.relative_to(tmp_path)}: another process runs it, left alone" in captured.out
     assert captured.out.count("skipped") == 1
+    assert "(1 running, 1 finished)" in captured.out
     assert (run / "metrics.json").stat().st_mtime_ns == before
 
 

@@ -36,7 +36,7 @@ class RunFolder:
         self.pictures = self.path / "pictures"
         self.record_path = self.path / "run.json"
         self.facts: dict[str, Any] = {}  # more that run.json shall tell
-        self.skip = False  # the run has finished before, nothing is to be done
+        self.skip = ""  # why nothing is to be done
         self.lock: int | None = None  # descriptor of a lock, closed when the run ends
 
     def __str__(self) -> str:

@@ -3,8 +3,8 @@
     outputs/sweeps/<sweep>/multirun.yaml                 what was swept, by Hydra
                            <what differs>_<hash>/        a run folder for each job; the hash is that of its config
 
-A job whose folder tells that it finished is skipped; one that was interrupted goes on from its last checkpoint, or
-starts again where it has none.
+A job whose folder tells that it finished, or that another process runs, is skipped; one that was interrupted goes on
+from its last checkpoint, or starts again where it has none.
 """
 
 import hashlib
@@ -72,10 +72,7 @@ def check_job(config: Mapping[str, Any]) -> None:
 def job_folder(config: Mapping[str, Any]) -> RunFolder:
     """The run folder of this job of a sweep, locked until the process ends; made empty where nothing can be kept.
 
-    `folder.skip` tells that its run has finished, and there is nothing left to do.
-
-    Raises:
-        ValueError: another process runs this job.
+    `folder.skip` tells why there is nothing to do: its run has finished, or another process is at it.
     """
     from hydra.core.hydra_config import HydraConfig
 
@@ -85,10 +82,14 @@ def job_folder(config: Mapping[str, Any]) -> RunFolder:
     found = [run for run in runs(sweep) if read_json(run.record_path).get("config_hash") == digest]
     folder = found[0] if found else RunFolder(sweep / f"{label}_{digest[:8]}")
     folder.path.mkdir(parents=True, exist_ok=True)
-    folder.lock = locked(folder.path)
+    try:
+        folder.lock = locked(folder.path)
+    except ValueError:
+        folder.skip = "another process runs it, left alone"
+        return folder
     remove_leftovers(folder.path)
-    record = folder.read_record()
-    folder.skip = record.get("status") == "finished"
+    if folder.read_record().get("status") == "finished":
+        folder.skip = "has finished before, skipped"
     if not folder.skip and not folder.last.exists():  # nothing to go on from
         for entry in folder.path.iterdir():
             shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
@@ -126,6 +127,14 @@ def locked(path: Path) -> int:
     return descriptor
 
 
+def runs_elsewhere(run: RunFolder) -> bool:
+    try:
+        os.close(locked(run.path))
+    except ValueError:
+        return True
+    return False
+
+
 def parameters(overrides: Sequence[str], compose: Callable[..., Any]) -> list[str]:
     """The overrides that the config itself sweeps over, but for those that the command line sets."""
     given = {override.key_or_group for override in parse(list(overrides))}
@@ -155,7 +164,8 @@ def run(start: Callable[[], None], folder: Path) -> None:
         raise
     print(closing(folder), flush=True)
     ended = [run for run in runs(folder) if run.record_path.stat().st_mtime > began]
-    if any(run.read_record().get("status") != "finished" for run in ended):  # Optuna goes on without them
+    broken = [run for run in ended if run.read_record().get("status") != "finished" and not runs_elsewhere(run)]
+    if broken:  # Optuna goes on without them
         sys.exit(1)
 
 
