@@ -7,7 +7,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup check test train sweep board bench clean
+.PHONY: help setup check test coverage train sweep board bench clean
 
 help:   ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -30,6 +30,9 @@ check: $(STAMP)   ## lint, format and types
 
 test: $(STAMP)   ## the test suite (minutes); ARGS="-m slow" for the slow ones
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto $(ARGS)
+
+coverage: $(STAMP)   ## the test suite, and which lines of pnu/ it does not reach
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --cov=pnu $(ARGS)
 
 train: $(STAMP)   ## train the paper's network on embedded data: a small success in minutes
 	$(BIN)/python -m pnu.train experiment=quickstart $(ARGS)

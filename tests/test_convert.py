@@ -9,6 +9,7 @@ import torch
 import pnu
 from pnu.convert import main
 from pnu.io import read_json
+from tests.commands import refused
 
 
 @pytest.fixture
@@ -28,15 +29,6 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The one line on stderr of a command that ends with exit code 2."""
-    with pytest.raises(SystemExit) as stop:
-        main(list(arguments))
-    assert stop.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    return line
-
-
 def test_conversion(released: dict[str, np.ndarray], capsys: pytest.CaptureFixture[str]) -> None:
     main(["input=epoch_7.pt", "output=run"])
     assert capsys.readouterr().out.splitlines() == [
@@ -51,7 +43,7 @@ def test_conversion(released: dict[str, np.ndarray], capsys: pytest.CaptureFixtu
     record = read_json("run/run.json")
     assert record["status"] == "finished"
     assert (record["source"], record["epoch"], record["training_loss"]) == ("epoch_7.pt", 7, 0.25)
-    assert "exists already" in refused(capsys, "input=epoch_7.pt", "output=run")
+    assert "exists already" in refused(capsys, main, ["input=epoch_7.pt", "output=run"])
 
 
 def test_bad_input(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -71,6 +63,6 @@ def test_bad_input(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
         "none": "input=none.pt: no such file; expected a checkpoint epoch_N.pt",
     }
     for name, text in expected.items():
-        assert refused(capsys, f"input={name}.pt", "output=run").startswith(f"error: {text}")
-    assert "the folder nowhere does not exist" in refused(capsys, "input=other.pt", "output=nowhere/run")
+        assert refused(capsys, main, [f"input={name}.pt", "output=run"]).startswith(f"error: {text}")
+    assert "the folder nowhere does not exist" in refused(capsys, main, ["input=other.pt", "output=nowhere/run"])
     assert sorted(place.iterdir()) == before

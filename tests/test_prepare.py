@@ -10,6 +10,7 @@ from pnu.data import shapes
 from pnu.data.patchset import check
 from pnu.io import write_mesh
 from pnu.prepare import main
+from tests.commands import refused
 
 
 @pytest.fixture
@@ -31,15 +32,6 @@ def prepare(folder: Path, *overrides: str) -> None:
             *overrides,
         ]
     )
-
-
-def refused(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> str:
-    with pytest.raises(SystemExit) as stopped:
-        main(arguments)
-    assert stopped.value.code == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    return error
 
 
 def test_meshes_become_a_file_that_training_takes(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -70,14 +62,14 @@ def test_describe(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_refusals(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cache = f"data.cache={folder / 'cache'}"
-    assert "none.h5: no such file" in refused(capsys, [f"describe={folder / 'none.h5'}"])
-    assert "data.root=FOLDER is required" in refused(capsys, ["data=meshes", cache])
-    assert "data.path=FILE is required" in refused(capsys, ["data=patches"])
-    assert "expected organic or cad, found 'metal'" in refused(capsys, ["data.kinds=[metal]", cache])
-    assert "data.patchs" in refused(capsys, ["data.patchs=3"])
+    assert "none.h5: no such file" in refused(capsys, main, [f"describe={folder / 'none.h5'}"])
+    assert "data.root=FOLDER is required" in refused(capsys, main, ["data=meshes", cache])
+    assert "data.path=FILE is required" in refused(capsys, main, ["data=patches"])
+    assert "expected organic or cad, found 'metal'" in refused(capsys, main, ["data.kinds=[metal]", cache])
+    assert "data.patchs" in refused(capsys, main, ["data.patchs=3"])
     (folder / "meshes/broken.obj").write_text("v 0 0 0\n")
     mesh = [f"data.root={folder / 'meshes'}", "data.patches=3", "quiet=true"]
-    assert "broken" in refused(capsys, ["data=meshes", cache, *mesh])
+    assert "broken" in refused(capsys, main, ["data=meshes", cache, *mesh])
     assert not list((folder / "cache").glob("*"))
 
 

@@ -21,6 +21,7 @@ from pnu.checkpoint import newest_run, read
 from pnu.run.config import config_folder
 from pnu.run.sweep import locked
 from pnu.train import main
+from tests.commands import refused
 
 Train = Callable[..., Path]
 
@@ -294,35 +295,26 @@ def test_a_run_of_an_older_version_goes_on(train: Train) -> None:
     assert yaml.safe_load((run / "config.yaml").read_text())["objective"] is None
 
 
-def refused(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> str:
-    with pytest.raises(SystemExit) as stopped:
-        main(arguments)
-    assert stopped.value.code == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    return error
-
-
 def test_what_a_run_has_learnt_cannot_change(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    error = refused(capsys, [f"run={finished}", "resume=true", "loss.w1=2"])
+    error = refused(capsys, main, [f"run={finished}", "resume=true", "loss.w1=2"])
     assert "loss.w1=2: a run that goes on keeps its config; what may change: run, resume, quiet" in error
 
 
 def test_resume_needs_a_run_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "resume=true needs run=FOLDER" in refused(capsys, ["resume=true"])
-    assert "expected a run folder with config.yaml" in refused(capsys, ["resume=true", f"run={tmp_path}"])
+    assert "resume=true needs run=FOLDER" in refused(capsys, main, ["resume=true"])
+    assert "expected a run folder with config.yaml" in refused(capsys, main, ["resume=true", f"run={tmp_path}"])
 
 
 def test_a_run_is_not_resumed_while_it_runs(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     held = locked(finished)
     try:
-        assert "another process runs this job; wait for it" in refused(capsys, [f"run={finished}", "resume=true"])
+        assert "another process runs this job; wait for it" in refused(capsys, main, [f"run={finished}", "resume=true"])
     finally:
         os.close(held)
 
 
 def test_a_run_is_not_overwritten(train: Train, finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "holds a run (finished)" in refused(capsys, [f"run={finished}"])
+    assert "holds a run (finished)" in refused(capsys, main, [f"run={finished}"])
     assert record(finished)["status"] == "finished"
 
 
@@ -343,7 +335,7 @@ def test_a_strangers_run_folder_runs_no_code(
     config = yaml.safe_load((run / "config.yaml").read_text())
     config[group]["_target_"] = target
     (run / "config.yaml").write_text(yaml.safe_dump(config))
-    assert "expected a class" in refused(capsys, [f"run={run}", "resume=true"])
+    assert "expected a class" in refused(capsys, main, [f"run={run}", "resume=true"])
 
 
 def test_a_strangers_key_is_refused(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -352,7 +344,7 @@ def test_a_strangers_key_is_refused(finished: Path, tmp_path: Path, capsys: pyte
     config = yaml.safe_load((run / "config.yaml").read_text())
     config["model"]["command"] = "rm"
     (run / "config.yaml").write_text(yaml.safe_dump(config))
-    assert "unknown key 'model.command'" in refused(capsys, [f"run={run}", "resume=true"])
+    assert "unknown key 'model.command'" in refused(capsys, main, [f"run={run}", "resume=true"])
 
 
 # --- failures ---
