@@ -124,7 +124,7 @@ def cloud_files(suffix: str) -> Callable[[], list[bytes]]:
         points, normals = rng.normal(size=(2, 20, 3))
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         attributes = {"colors": rng.integers(0, 256, (20, 3)).astype(np.uint8), "time": rng.normal(size=20)}
-        keeps = attributes if suffix in (".ply", ".pcd") else {}
+        keeps = attributes if suffix in (".ply", ".pcd", ".las", ".laz") else {}
         made = [written(suffix, lambda path: write_cloud(path, points, normals, keeps))]
         made += [written(suffix, lambda path: write_cloud(path, points))]
         rows = "\n".join(f"{x:.3f} {y:.3f} {z:.3f}" for x, y, z in points)
@@ -349,6 +349,32 @@ def stl_files(draw: st.DrawFn) -> bytes:
 
 
 @st.composite
+def las_files(draw: st.DrawFn) -> bytes:
+    """A header whose sizes and counts may lie, records of the kinds that a reader interprets, points."""
+    form, length = draw(st.sampled_from([(0, 20), (6, 30), (7, 36), (3, 34), (128, 20), (134, 30), (10, 67), (63, 1)]))
+    length = draw(st.sampled_from([length, length, length + 6, 0, 65535]))
+    points = draw(st.sampled_from([20, 20, 0, 2**31, 2**32 - 1]))
+    minor, start = draw(st.sampled_from([(2, 227), (4, 375), (0, 227), (9, 375)]))
+    records = b""
+    kinds = st.sampled_from([(b"LASF_Spec", 4), (b"laszip encoded", 22204), (b"LASF_Projection", 34735), (b"copc", 1)])
+    bodies = junk | st.just(b"\0\0\3\0" + b"nx".ljust(188, b"\0")) | st.just(struct.pack("<HHBBHIIqqH", 2, *[0] * 9))
+    chosen = draw(st.lists(st.tuples(kinds, bodies), max_size=3))
+    for (user, kind), content in chosen:
+        size = draw(st.sampled_from([len(content), len(content), 0, 65535]))
+        records += struct.pack("<H16sHH32s", 0, user, kind, size, b"") + content
+    count = draw(st.sampled_from([len(chosen), len(chosen), 0, 10**5, 2**32 - 1]))
+    offset = draw(st.sampled_from([start + len(records), start + len(records), 0, 2**32 - 1]))
+    size = draw(st.sampled_from([start, start, 0, 65535]))
+    head = struct.pack("<4s20xBB64x4xHIIBHI20x", b"LASF", 1, minor, size, offset, count, form, length, points)
+    scales = draw(st.lists(st.sampled_from([0.01, 1.0, 0.0, 1e300, np.nan, -1.0]), min_size=6, max_size=6))
+    head += struct.pack("<12d", *scales, *[0.0] * 6)
+    far = st.sampled_from([0, 0, 20, 2**31, 2**63])
+    head += struct.pack("<QQIQ120x", draw(far), draw(far), draw(far) % 2**32, draw(st.sampled_from([points, 2**62])))
+    rows = np.random.default_rng(draw(st.integers(0, 9))).bytes(draw(st.sampled_from([20 * length, 0, 77])))
+    return head[:start] + records + rows
+
+
+@st.composite
 def h5_files(draw: st.DrawFn) -> bytes:
     import h5py
 
@@ -435,6 +461,8 @@ READERS = {
     "obj": of_clouds(".obj", obj_files()),
     "off": of_clouds(".off", off_files()),
     "npy": of_clouds(".npy", npy_files()),
+    "las": of_clouds(".las", las_files()),
+    "laz": of_clouds(".laz", las_files()),
     "ply mesh": of_meshes(".ply", ply_files()),
     "obj mesh": of_meshes(".obj", obj_files()),
     "off mesh": of_meshes(".off", off_files()),

@@ -16,13 +16,14 @@ def check(results: list[dict], readers: int, cases: int) -> None:
 
 
 def test_a_few_cases_of_every_reader(tmp_path: Path) -> None:
-    check(fuzz(list(READERS), 18, 7, tmp_path), len(READERS), 18)  # 252 in all
+    readers = [name for name in READERS if name != "laz"]  # which takes a process a case
+    check(fuzz(readers, 18, 7, tmp_path), len(readers), 18)  # 270 in all
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", READERS)
 def test_thousands_of_cases(name: str, tmp_path: Path) -> None:
-    """800 for each reader, 11200 in all."""
+    """800 for each reader, 12800 in all."""
     check(fuzz([name], 800, 0, tmp_path), 1, 800)
 
 

@@ -194,6 +194,20 @@ def test_damaged_bytes_never_crash(tmp_path: Path, cloud: tuple[Array, Array], s
 # Writing
 
 
+def test_a_crash_of_the_decompressor_is_an_error(tmp_path: Path, cloud: tuple[Array, Array]) -> None:
+    """laz whose table counts billions of parts, for which the decompressor asks 62 GB and then ends its process."""
+    path = tmp_path / "cloud.laz"
+    write_cloud(path, *cloud)
+    data = bytearray(path.read_bytes())
+    (points,) = struct.unpack_from("<I", data, 96)
+    (table,) = struct.unpack_from("<q", data, points)
+    struct.pack_into("<I", data, table + 4, 2**32 - 1)
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"cloud\.laz: is no las file that can be read \(.*\); export") as error:
+        read_cloud(path)
+    assert "\n" not in str(error.value)
+
+
 def test_bad_output(tmp_path: Path, cloud: tuple[Array, Array]) -> None:
     with pytest.raises(ValueError, match=r"the folder .*nowhere does not exist; create it first"):
         check_output(tmp_path / "nowhere" / "c.ply")

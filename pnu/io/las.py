@@ -1,13 +1,21 @@
 """Lidar exchange format, las and compressed laz, a slice at a time; needs laspy: pip install 'pnu[las]'."""
 
+import os
 import struct
-from collections.abc import Mapping
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
+from pnu.io import las_child
+
 SLICE = 2**20  # points
+SLICE_BYTES = 2**28  # at most, whatever size of a point a header claims
 MOST = 100  # points that a byte of laz may hold: bounds what a damaged header makes us allocate
 NORMAL = ("nx", "ny", "nz")  # extra dimensions
 CARRIED = ("intensity", "classification", "gps_time")
@@ -32,7 +40,7 @@ def read_las(path: Path) -> Content:
         with laspy.open(path) as file:
             if file.header.point_count > MOST * path.stat().st_size:
                 raise ValueError(f"its header promises {file.header.point_count} points, more than it has room for")
-            return _content(file)
+            return _content(file.header, _slices(laspy, path, file))
     except Exception as error:  # laspy and its decompressors know many kinds
         reason = (str(error).splitlines() or [""])[0][:80]
         raise ValueError(f"{path}: is no las file that can be read ({reason}); export it again") from None
@@ -52,16 +60,41 @@ def _check_counts(path: Path) -> None:
         raise ValueError("its header counts more records than it has room for")
 
 
-def _content(file) -> Content:  # type: ignore[no-untyped-def]
-    n = file.header.point_count
-    known = set(file.header.point_format.dimension_names)
-    extra = [name for name in file.header.point_format.extra_dimension_names if name not in NORMAL]
+def _slices(laspy: ModuleType, path: Path, file: Any) -> Iterator[Any]:
+    """The points of an open file; compressed ones from a child process, which may crash without loss."""
+    header = file.header
+    kind = header.point_format.dtype()
+    rows = max(1, min(SLICE, SLICE_BYTES // kind.itemsize))
+    if not header.are_points_compressed:
+        yield from file.chunk_iterator(rows)
+        return
+    command = [sys.executable, "-I", las_child.__file__, str(path), str(rows)]
+    environment = os.environ | {"RUST_BACKTRACE": "0"}
+    with (
+        tempfile.TemporaryFile() as said,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=said, env=environment) as child,
+    ):
+        assert child.stdout is not None
+        while data := child.stdout.read(rows * kind.itemsize):
+            records = np.frombuffer(data, kind, len(data) // kind.itemsize).copy()
+            yield laspy.ScaleAwarePointRecord(records, header.point_format, header.scales, header.offsets)
+        if child.wait():
+            said.seek(0)
+            raise ValueError(
+                said.read().decode(errors="replace").strip() or f"its decompressor ended with {child.returncode}"
+            )
+
+
+def _content(header: Any, slices: Iterator[Any]) -> Content:
+    n = header.point_count
+    known = set(header.point_format.dimension_names)
+    extra = [name for name in header.point_format.extra_dimension_names if name not in NORMAL]
     points = np.empty((n, 3))
     normals = np.empty((n, 3)) if known.issuperset(NORMAL) else None
     colors = np.empty((n, 3), np.uint16) if known.issuperset(COLORS) else None
     columns: dict[str, np.ndarray] = {}
     done = 0
-    for chunk in file.chunk_iterator(SLICE):
+    for chunk in slices:
         part = slice(done, done + len(chunk))
         points[part] = np.stack([chunk.x, chunk.y, chunk.z], 1)
         if normals is not None:
