@@ -5,8 +5,6 @@ Each is a module without weights that `pnu.upsample(points, normals, model=...)`
     dense = pnu.upsample(points, normals, ratio=4, model=classical.method("apss"))
 """
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -17,10 +15,9 @@ from pnu.io import Mesh
 from pnu.ops.apss import apss_project
 from pnu.ops.mesh import vertex_normals
 from pnu.ops.nearest import knn, nearest
+from pnu.ops.progress import Progress
 from pnu.ops.sampling import farthest_points_large
 from pnu.ops.surface import sample_poisson_disk
-
-Progress = Callable[[str, int, int], None]
 
 
 class APSS(nn.Module):

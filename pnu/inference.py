@@ -1,9 +1,9 @@
 """Densify whole clouds with a trained network: no Hydra, no Lightning, usable from a notebook."""
 
+import copy
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -16,22 +16,22 @@ from torch import Tensor, nn
 from pnu import checkpoint
 from pnu.io import Cloud, check_cloud
 from pnu.models.surface import Surface
-from pnu.ops import patches
+from pnu.ops import patches, threads
 from pnu.ops.attributes import carry
 from pnu.ops.nearest import nearest
 from pnu.ops.normalize import Frame, unit_sphere_frame
 from pnu.ops.normals import estimate_normals, flip_to_reference
 from pnu.ops.parts import Keep, Parts, forget
+from pnu.ops.progress import Progress
+from pnu.ops.workers import Begin, Here, Processes, Work, Workers
 
 MINIMUM = 16  # points of a cloud
 SMALLEST_PATCH = 64  # points that every network accepts; a smaller cloud is repeated up to it
 LARGEST = 10**9  # points of an output
 SLACK = 1.1  # growth beyond the network's ratio for which overlapping patches have points enough
 KEPT = 256  # patches whose predictions are kept in one file
+BATCHES = 32  # on a CPU, that its threads share
 ZERO = 1e-6  # predicted normals shorter than this have no direction
-
-Progress = Callable[[str, int, int], None]
-"""progress(stage, done, total): called before the first and after each step of a stage."""
 
 
 @runtime_checkable
@@ -55,6 +55,7 @@ def upsample(
     model: nn.Module | str | PathLike[str] | None = None,
     patch_size: int | None = None,
     device: str = "auto",
+    devices: int = 1,
     batch_size: int | None = None,
     seed: int = 0,
     progress: Progress | None = None,
@@ -76,6 +77,8 @@ def upsample(
             outputs/, or "surface" where there is none.
         patch_size: points of a patch; default: what the network was made for (1024).
         device: "auto" (where the given network is; else CUDA where there is one), "cpu", "cuda", "cuda:1" ...
+        devices: CUDA devices, or processes on the CPU, that share the work of the network; the result is the same for
+            any number. More than one needs `if __name__ == "__main__":` in a script.
         batch_size: patches at once on a GPU, by default 64; on the CPU each thread takes one.
         seed: of models that draw random numbers; the paper's procedure draws none.
         progress: called as progress(stage, done, total).
@@ -90,20 +93,27 @@ def upsample(
     progress = progress or (lambda stage, done, total: None)
     given = check_cloud(Cloud(np.asarray(points), normals, {}), "points", minimum=MINIMUM)
     count = output_count(len(given.points), ratio)
-    for name, value in (("patch_size", patch_size), ("batch_size", batch_size)):
+    for name, value in (("patch_size", patch_size), ("batch_size", batch_size), ("devices", devices)):
         if value is not None and value < 1:
             raise ValueError(f"{name}={value}: expected a whole number >= 1")
     network, target = _on_device(model if isinstance(model, nn.Module) else source(model, normals), device)
-    upsampler = network if isinstance(network, CloudUpsampler) else Patchwise(network, patch_size)
+    upsampler = _upsampler(network, patch_size)
     sparse, frame = _prepare(given, progress)
     generator = torch.Generator().manual_seed(seed)
     options: dict[str, Any] = {}
-    if parts is not None and isinstance(upsampler, Surface | Patchwise):
+    in_parts = isinstance(upsampler, Surface | Patchwise)
+    if parts is not None and in_parts:
         options["keep"] = Parts(Path(parts) / _digest(network, sparse, count, upsampler))
+    if devices > 1 and not in_parts:
+        raise ValueError(f"devices={devices}: {type(network).__name__} works in one process; leave devices=1")
+    names = _names(target, devices)
     training = network.training
     network.eval()
     try:
-        with torch.no_grad():
+        with torch.no_grad(), ExitStack() as stack:
+            if devices > 1:
+                make = partial(_begin, copy.deepcopy(network).cpu(), patch_size, batch_size)
+                options["workers"] = stack.enter_context(Processes(make, names))
             raw = upsampler.upsample_cloud(
                 sparse.to(target), count, batch_size=batch_size, generator=generator, progress=progress, **options
             )
@@ -166,6 +176,27 @@ def _on_device(model: nn.Module | str | PathLike[str], device: str) -> tuple[nn.
     return network.to(target), target
 
 
+def _names(target: torch.device, devices: int) -> list[str]:
+    """Of as many devices as are asked for, of the kind of the target."""
+    if devices == 1 or target.type == "cpu":
+        return [str(target)] * devices
+    here = torch.cuda.device_count()
+    if devices > here:
+        raise ValueError(f"devices={devices}: expected at most {here}, as many CUDA devices as are here")
+    return [f"cuda:{number}" for number in range(devices)]
+
+
+def _upsampler(network: nn.Module, patch_size: int | None) -> "CloudUpsampler":
+    return network if isinstance(network, CloudUpsampler) else Patchwise(network, patch_size)
+
+
+def _begin(network: nn.Module, patch_size: int | None, batch_size: int | None, device: str) -> Begin:
+    """What a process of its own does with clouds."""
+    upsampler = _upsampler(network.to(device), patch_size)
+    work = upsampler.projections if isinstance(upsampler, Surface) else cast(Patchwise, upsampler).predictions
+    return partial(work, batch_size=batch_size)
+
+
 def _digest(network: nn.Module, sparse: Tensor, count: int, upsampler: object) -> str:
     """Of all that the parts of a computation depend on."""
     digest = hashlib.sha256(sparse.numpy().tobytes())
@@ -221,14 +252,16 @@ class Patchwise:
         generator: torch.Generator,
         progress: Progress,
         keep: Keep = forget,
+        workers: Workers | None = None,
     ) -> Tensor:
         """cloud (n, 6) in the unit sphere -> (count, 3 or 6) on the CPU; nothing is random."""
         cloud = cloud.cpu()
-        batch_size = 1 if self.like.device.type == "cpu" else batch_size or 64
+        workers = workers or Here(partial(self.predictions, batch_size=batch_size))
+        together = self.batch(batch_size) * (BATCHES if self.like.device.type == "cpu" else 1)
         *before, last = self.pass_sizes(len(cloud), count)
         for size in before:
-            cloud = with_unit_normals(self._one_pass(cloud, size, batch_size, progress, keep), cloud)
-        return self._one_pass(cloud, last, batch_size, progress, keep)
+            cloud = with_unit_normals(self._one_pass(cloud, size, together, workers, progress, keep), cloud)
+        return self._one_pass(cloud, last, together, workers, progress, keep)
 
     def pass_sizes(self, n: int, count: int) -> list[int]:
         """Number of points after each pass from n to count: as few passes as possible, all with the same growth."""
@@ -241,58 +274,59 @@ class Patchwise:
             sizes.append(min(math.ceil(n * (count / n) ** (i / passes)), self.ratio * sizes[-1]))
         return [*sizes[1:], count]
 
-    def _one_pass(self, cloud: Tensor, count: int, batch_size: int, progress: Progress, keep: Keep) -> Tensor:
+    def _one_pass(
+        self, cloud: Tensor, count: int, together: int, workers: Workers, progress: Progress, keep: Keep
+    ) -> Tensor:
         """The network on patches of the cloud (n, 6), and farthest points of all it predicts: (count, 3 or 6)."""
         n, size = len(cloud), min(self.patch_size, len(cloud))
         centers = 1 if size == n else max(1, round(self.ratio * n / size))
+        stage = f"network, {n} points"
+        progress(stage, 0, centers)
         idx = patches.extract(cloud, centers, size, cover=True)
         if size < SMALLEST_PATCH:
             idx = idx[:, torch.arange(SMALLEST_PATCH) % size]
-        stage = f"network, {n} points"
-        done = 0
 
-        def predict(group: Tensor) -> Tensor:
-            dense = []
-            for patch in self._predict(cloud, group.split(batch_size)):
-                dense.append(patch.flatten(0, 1))
-                progress(stage, min(done + len(dense) * batch_size, len(idx)), len(idx))
-            return torch.cat(dense)
+        def predict(first: int) -> Tensor:
+            found = []
+            for number, part in enumerate(workers.map(cloud, idx[first : first + KEPT].split(together)), 1):
+                found.append(part)
+                progress(stage, min(first + number * together, len(idx)), len(idx))
+            return torch.cat(found)
 
-        progress(stage, 0, len(idx))
-        predicted = []
-        for group in idx.split(KEPT):
-            predicted.append(keep(f"{stage}, patch {done}", partial(predict, group)))
-            done += len(group)
-        progress(stage, done, len(idx))
-        everything = _finite(torch.cat(predicted))
-        stage = f"farthest points, {count} of {len(everything)}"
-        progress(stage, 0, 1)
-        kept = patches.merge(everything[None], count)
-        progress(stage, 1, 1)
-        return kept
+        predicted = torch.empty(0)
+        for first in range(0, len(idx), KEPT):
+            found = keep(f"{stage}, patch {first}", partial(predict, first))
+            each = len(found) // min(KEPT, len(idx) - first)  # points of a patch
+            if not first:
+                predicted = found.new_empty(len(idx) * each, found.shape[1])
+            predicted[first * each : first * each + len(found)] = found
+        progress(stage, len(idx), len(idx))
+        stage = f"farthest points, {count} of {len(predicted)}"
+        return patches.merge(_finite(predicted)[None], count, partial(progress, stage))
 
-    def _predict(self, cloud: Tensor, batches: Sequence[Tensor]) -> Iterator[Tensor]:
-        """Predictions for batches of patches, in the cloud's frame.
+    def predictions(self, cloud: Tensor, batch_size: int | None = None) -> Work:
+        """Of a cloud (n, 6): patches idx (p, size) -> their predictions, one after the other, in the cloud's frame.
 
-        On the CPU each thread works on a patch of its own. That is faster than many threads in one operation, and the
+        On the CPU each thread works on patches of its own. That is faster than many threads in one operation, and the
         last digit of a matrix product, which may decide between two farthest points, depends on nothing else.
         """
+        on_cpu, size = self.like.device.type == "cpu", self.batch(batch_size)
 
-        @torch.no_grad()
         def predict(idx: Tensor) -> Tensor:
             patch = cloud[idx]
             frame = unit_sphere_frame(patch)  # in float64, so that float32 has only the patch to resolve
-            return frame.from_unit(self.network(frame.to_unit(patch).to(self.like)).cpu().double())
+            dense = frame.from_unit(self.network(frame.to_unit(patch).to(self.like)).cpu().double())
+            return dense.flatten(0, 1)
 
-        threads = torch.get_num_threads()
-        if threads == 1 or self.like.device.type != "cpu":
-            yield from map(predict, batches)
-            return
-        try:
-            with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-                yield from pool.map(predict, batches)
-        finally:
-            torch.set_num_threads(threads)
+        def work(idx: Tensor) -> Tensor:
+            batches = idx.split(size)
+            return torch.cat(threads.spread(predict, batches) if on_cpu else [predict(batch) for batch in batches])
+
+        return work
+
+    def batch(self, batch_size: int | None) -> int:
+        """Patches at once."""
+        return 1 if self.like.device.type == "cpu" else batch_size or 64
 
 
 def with_unit_normals(dense: Tensor, sparse: Tensor) -> Tensor:

@@ -33,6 +33,7 @@ class Upsample:
     patch_size: int | None = doc("points of a patch; null: what the network was made for")
     batch_size: int | None = doc("patches at once on a GPU, bounds its memory; null: 64")
     device: str = doc("auto, cpu, cuda, cuda:1 ...")
+    devices: int = doc("CUDA devices, or processes on the CPU, that share the work; the result stays the same")
     seed: int = doc("of models that draw random numbers")
     quiet: bool = doc("print nothing but errors")
 
@@ -72,6 +73,7 @@ def upsample(cfg: Any) -> None:
             model=run,
             patch_size=cfg.patch_size,
             device=cfg.device,
+            devices=cfg.devices,
             batch_size=cfg.batch_size,
             seed=cfg.seed,
             progress=progress,

@@ -31,7 +31,7 @@ def patches() -> PNU:
 
 @pytest.mark.parametrize("model", ["surface", "patches"])
 def test_an_interrupted_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, model: str) -> None:
-    monkeypatch.setattr(surface, "SEARCHED", 1000)
+    monkeypatch.setattr(surface, "KEPT", 1000)
     monkeypatch.setattr(inference, "KEPT", 3)
     points = sphere(800)
     network = "surface" if model == "surface" else patches()

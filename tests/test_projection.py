@@ -213,13 +213,13 @@ def test_most_doubtful_points_are_dropped() -> None:
     model, cloud = trained(), wavy(300)
     model.reject = 0.5
     every = {}
-    project = model.in_batches
+    project = model.in_parts
 
     def spy(query: Tensor, cloud: Tensor, **options: Any) -> tuple[Tensor, Tensor]:
         every["last"] = project(query, cloud, **options)
         return every["last"]
 
-    model.in_batches = spy  # type: ignore[method-assign]
+    model.in_parts = spy  # type: ignore[method-assign]
     dense = model.upsample_cloud(cloud, 600)
     points, error = every["last"]
     assert len(points) == 900

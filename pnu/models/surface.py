@@ -5,7 +5,6 @@ a first foot and normal; a small network shared by all neighbours, with maximum 
 There are no patches, hence no borders; the cost grows with the output; any ratio is possible.
 """
 
-from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -13,19 +12,23 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from pnu.ops import threads
+from pnu.ops.blocks import along_curve
 from pnu.ops.frames import FEATURES, local_frames
 from pnu.ops.grouping import gather
-from pnu.ops.nearest import knn
+from pnu.ops.nearest import Search, knn
 from pnu.ops.noise import noise_level
 from pnu.ops.parts import Keep, forget
+from pnu.ops.progress import Progress, Step, unheard
 from pnu.ops.sampling import farthest_points, farthest_points_large
 from pnu.ops.spacing import spacing
 from pnu.ops.spread import repel, tangent_discs
+from pnu.ops.workers import Here, Work, Workers
 
 EACH = 3  # seeds of a point, in training, before they are thinned out
 PUSH = 0.1  # between rounds of training, beside the way from its point to a seed
 SMOOTH = 0.1  # noise in spacings from which on a cloud is smoothed first
-SEARCHED = 2**19  # queries whose neighbours are searched at once: the search sorts the whole cloud first
+KEPT = 2**19  # queries whose projections are kept in one file
+BATCHES = 32  # on a CPU, that its threads share
 DENSE = 16  # neighbours that are all looked at; farther ones are thinned out
 
 
@@ -179,68 +182,92 @@ class Surface(nn.Module):
         *,
         batch_size: int | None = None,
         generator: torch.Generator | None = None,
-        progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+        progress: Progress = lambda stage, done, total: None,
         keep: Keep = forget,
+        workers: Workers | None = None,
     ) -> Tensor:
-        """cloud (n, 6) -> (count, 6) with unit normals. Nothing is random; batch_size: queries at once.
+        """cloud (n, 6) -> (count, 6) with unit normals. Nothing is random.
 
-        The points of a cloud that is noisy beside their spacing are themselves projected first.
+        The points of a cloud that is noisy beside their spacing are themselves projected first. batch_size: queries at
+        once; keep: what takes finished parts; workers: who projects, with `projections`.
         """
-        run = partial(self.in_batches, batch_size=batch_size, progress=progress, keep=keep)
+        workers = workers or Here(partial(self.projections, batch_size=batch_size))
+        run = partial(self.in_parts, workers=workers, batch_size=batch_size, progress=progress, keep=keep)
         if noise_in_spacings(cloud) > SMOOTH:
             cloud, _ = run(cloud, cloud, stage="smoothing, the points are noisy")
         each = max(1, round(self.seeds * count / len(cloud)))
-        query = keep("seeds", lambda: seeds_around(cloud, each, round(self.candidates * count))).to(cloud)
+        query = keep(
+            "seeds", lambda: seeds_around(cloud, each, round(self.candidates * count), partial(progress, "seeds"))
+        ).to(cloud)
         query, error = run(query, cloud, stage="projection")
-        query = keep("thinned", partial(thin, query, round((1 + self.reject) * count))).to(cloud)
+        more = round((1 + self.reject) * count)
+        query = keep("thinned", lambda: thin(query, more, partial(progress, "thinning"))).to(cloud)
         if self.relaxation:
-            query = keep("even", partial(evened, query, self.relaxation)).to(cloud)
+            query = keep("even", lambda: evened(query, self.relaxation, partial(progress, "even spacing"))).to(cloud)
         for i in range(self.refinements):
             query, error = run(query, cloud, stage=f"refinement {i + 1}")
         return query[error.argsort(stable=True)[:count].sort().values]
 
-    def in_batches(
+    def in_parts(
         self,
         query: Tensor,
         cloud: Tensor,
         *,
+        workers: Workers,
         batch_size: int | None,
-        progress: Callable[[str, int, int], None],
+        progress: Progress,
         keep: Keep,
         stage: str,
     ) -> tuple[Tensor, Tensor]:
-        """query (m, 6) -> projected (m, 6) and logarithm of the expected error (m,).
+        """query (m, 6) -> projected (m, 6) and logarithm of the expected error (m,)."""
+        size = self.batch(cloud, batch_size) * (BATCHES if cloud.device.type == "cpu" else 1)
+        order = along_curve(query[:, :3])
+        query = query[order]
+
+        def kept(first: int) -> Tensor:
+            parts = query[first : first + KEPT].split(size)
+            found = []
+            for number, part in enumerate(workers.map(cloud, parts), 1):
+                found.append(part.to(cloud))
+                progress(stage, min(first + number * size, len(query)), len(query))
+            return torch.cat(found)
+
+        progress(stage, 0, len(query))
+        starts = range(0, len(query), KEPT)
+        everything = torch.empty(len(query), 7, dtype=query.dtype, device=query.device)
+        for first in starts:
+            everything[order[first : first + KEPT]] = keep(
+                f"{stage}, {first} of {len(query)}", partial(kept, first)
+            ).to(everything)
+        progress(stage, len(query), len(query))
+        return everything[:, :6], everything[:, 6]
+
+    def projections(self, cloud: Tensor, batch_size: int | None = None) -> Work:
+        """Around a cloud (n, 6): queries (m, 6) -> projected and logarithm of the expected error, (m, 7).
 
         On the CPU each thread works on batches of its own, so the result does not depend on their number.
         """
-        on_cpu = cloud.device.type == "cpu"
-        size = batch_size or (512 if on_cpu else 2**16)
-        together = 16 * torch.get_num_threads() if on_cpu else 1
+        cloud = cloud[along_curve(cloud[:, :3])].to(self.projector.out.weight.device)
+        search, size, reach = Search(cloud[:, :3]), self.batch(cloud, batch_size), min(self.reach, len(cloud))
 
-        def piece(first: int) -> Tensor:
-            searched = query[None, first : first + SEARCHED]
-            idx = self.neighbors(searched, cloud[None])
+        def work(query: Tensor) -> Tensor:
+            query = query.to(cloud)[None]
+            idx = search.knn(query[0, :, :3], reach).idx[None, :, self.ranks(len(cloud))]
 
             def project(part: slice) -> Tensor:
-                projected, log_error, spacing = self.project(searched[:, part], cloud[None], idx[:, part])
+                projected, log_error, spacing = self.project(query[:, part], cloud[None], idx[:, part])
                 return torch.cat([projected[0], (log_error[0] + spacing[0].log()).to(projected)[:, None]], 1)
 
-            batches = [slice(start, start + size) for start in range(0, searched.shape[1], size)]
-            parts: list[Tensor] = []
-            while len(parts) < len(batches):
-                progress(stage, first + len(parts) * size, len(query))
-                now = batches[len(parts) : len(parts) + together]
-                parts += threads.spread(project, now) if on_cpu else [project(now[0])]
-            return torch.cat(parts)
+            batches = [slice(start, start + size) for start in range(0, query.shape[1], size)]
+            on_cpu = cloud.device.type == "cpu"
+            return torch.cat(threads.spread(project, batches) if on_cpu else [project(batch) for batch in batches])
 
-        progress(stage, 0, len(query))
-        found = [
-            keep(f"{stage}, {first} of {len(query)}", partial(piece, first)).to(cloud)
-            for first in range(0, len(query), SEARCHED)
-        ]
-        progress(stage, len(query), len(query))
-        everything = torch.cat(found)
-        return everything[:, :6], everything[:, 6]
+        return work
+
+    @staticmethod
+    def batch(cloud: Tensor, batch_size: int | None) -> int:
+        """Queries at once."""
+        return batch_size or (512 if cloud.device.type == "cpu" else 2**16)
 
 
 def noise_in_spacings(cloud: Tensor) -> float:
@@ -248,26 +275,28 @@ def noise_in_spacings(cloud: Tensor) -> float:
     return noise_level(cloud[:, :3], cloud[:, 3:]) / spacing(cloud[:, :3].cpu().numpy())
 
 
-def seeds_around(cloud: Tensor, each: int, count: int) -> Tensor:
+def seeds_around(cloud: Tensor, each: int, count: int, step: Step = unheard) -> Tensor:
     """Points of a cloud (n, 6) and `each` seeds around each, thinned to (count, 6), with the points' normals."""
+    step(0, 1)
     discs = tangent_discs(cloud[:, :3], cloud[:, 3:], each)
     places = torch.cat([cloud[:, :3], discs.flatten(0, 1)])
     del discs
     if len(places) <= count:
         kept = torch.arange(len(places), device=cloud.device)
+        step(1, 1)
     else:
-        kept = torch.from_numpy(farthest_points_large(places, count)).to(cloud.device)
+        kept = torch.from_numpy(farthest_points_large(places, count, step=step)).to(cloud.device)
     owner = torch.where(kept < len(cloud), kept, (kept - len(cloud)) // each)
     return torch.cat([places[kept], cloud[owner, 3:]], 1)
 
 
-def evened(cloud: Tensor, steps: int) -> Tensor:
+def evened(cloud: Tensor, steps: int, step: Step = unheard) -> Tensor:
     """A cloud (m, 6) with points moved to an even spacing."""
-    return torch.cat([repel(cloud[:, :3], cloud[:, 3:], steps=steps), cloud[:, 3:]], 1)
+    return torch.cat([repel(cloud[:, :3], cloud[:, 3:], steps=steps, step=step), cloud[:, 3:]], 1)
 
 
-def thin(cloud: Tensor, count: int) -> Tensor:
+def thin(cloud: Tensor, count: int, step: Step = unheard) -> Tensor:
     """Farthest points of a cloud (n, 6): (min(n, count), 6)."""
     if len(cloud) <= count:
         return cloud
-    return cloud[torch.from_numpy(farthest_points_large(cloud[:, :3], count)).to(cloud.device)]
+    return cloud[torch.from_numpy(farthest_points_large(cloud[:, :3], count, step=step)).to(cloud.device)]

@@ -30,8 +30,7 @@ def knn(query: Tensor, target: Tensor, k: int) -> Neighbors:
     query (B, m, 3), target (B, n, 3); equal distances come in any order. ValueError if k is not in 1..n.
     """
     _check(query, target)
-    if not 1 <= k <= target.shape[1]:
-        raise ValueError(f"k: expected 1 to {target.shape[1]} neighbours (the number of target points), found {k}")
+    _check_k(k, target.shape[1])
     query, target = query.detach(), target.detach()
     if query.device.type == "cpu":
         return _knn_tree(query, target, k)
@@ -39,6 +38,28 @@ def knn(query: Tensor, target: Tensor, k: int) -> Neighbors:
     if kernels and k <= KERNEL_K:
         return Neighbors(*kernels.knn(query, target, k))
     return _knn_chunks(query, target, k)
+
+
+class Search:
+    """The k nearest points of one cloud (n, 3), looked up again and again: on the CPU its tree is built once.
+
+    Elsewhere float32 is searched, which the kernels take: points of a unit sphere lose nothing that matters.
+    """
+
+    def __init__(self, target: Tensor) -> None:
+        self.target = target.detach()
+        self.tree = cKDTree(self.target.double().numpy()) if target.device.type == "cpu" else None
+
+    def knn(self, query: Tensor, k: int) -> Neighbors:
+        """query (m, 3) -> as `knn`, but (m, k)."""
+        _check_k(k, len(self.target))
+        if self.tree is None:
+            found = knn(query[None].float(), self.target[None].float(), k)
+            return Neighbors(found.dist_sq[0].to(query.dtype), found.idx[0])
+        dist, idx = self.tree.query(
+            query.detach().double().numpy(), k=np.arange(1, k + 1), workers=torch.get_num_threads()
+        )
+        return Neighbors(torch.from_numpy(np.multiply(dist, dist, out=dist)).to(query.dtype), torch.from_numpy(idx))
 
 
 def nearest(query: Tensor, target: Tensor) -> Neighbors:
@@ -87,6 +108,11 @@ def gpu_kernels(points: Tensor) -> ModuleType | None:
     except ImportError:
         return None
     return kernels
+
+
+def _check_k(k: int, n: int) -> None:
+    if not 1 <= k <= n:
+        raise ValueError(f"k: expected 1 to {n} neighbours (the number of target points), found {k}")
 
 
 def _check(query: Tensor, target: Tensor) -> None:

@@ -3,7 +3,8 @@
 import torch
 from torch import Tensor
 
-from pnu.ops.nearest import knn, nearest
+from pnu.ops.nearest import Search, nearest
+from pnu.ops.progress import Step, unheard
 from pnu.ops.sampling import farthest_points_large
 
 
@@ -14,31 +15,34 @@ def extract(cloud: Tensor, count: int, size: int, *, cover: bool = False) -> Ten
     until every point lies in one, so there may be more than `count`. ValueError if count or size is not in 1..n.
     """
     points = cloud[:, :3].detach()
+    search = Search(points)
     centers = torch.from_numpy(farthest_points_large(points, count)).to(points.device)
-    idx = _around(points, centers, size)
-    while cover:
+    found = [_around(search, centers, size)]
+    if cover:
         missed = torch.ones(len(points), dtype=torch.bool, device=points.device)
-        missed[idx.flatten()] = False
+        missed[found[0].flatten()] = False
         left = missed.nonzero().flatten()
-        if not len(left):
-            break
         away = nearest(points[None, left], points[None, centers]).dist_sq[0]
-        center = left[away.argmax()][None]
-        centers, idx = torch.cat([centers, center]), torch.cat([idx, _around(points, center, size)])
-    return idx
+        while len(left):
+            center = left[away.argmax()]
+            found.append(_around(search, center[None], size))
+            missed[found[-1].flatten()] = False
+            away = torch.minimum(away, (points[left] - points[center]).square().sum(1))[missed[left]]
+            left = left[missed[left]]
+    return torch.cat(found)
 
 
-def merge(patches: Tensor, n: int) -> Tensor:
+def merge(patches: Tensor, n: int, step: Step = unheard) -> Tensor:
     """Exactly n evenly spread points of overlapping patches: patches (count, size, C) -> (n, C), farthest points.
 
     The first 3 columns are coordinates. ValueError if the patches hold fewer than n points.
     """
     cloud = patches.reshape(-1, patches.shape[-1])
-    return cloud[torch.from_numpy(farthest_points_large(cloud[:, :3], n)).to(cloud.device)]
+    return cloud[torch.from_numpy(farthest_points_large(cloud[:, :3], n, step=step)).to(cloud.device)]
 
 
-def _around(points: Tensor, centers: Tensor, size: int) -> Tensor:
-    idx = knn(points[None, centers], points[None], size).idx[0]
+def _around(search: Search, centers: Tensor, size: int) -> Tensor:
+    idx = search.knn(search.target[centers], size).idx
     absent = (idx != centers[:, None]).all(1)  # where more than `size` points coincide
     idx[absent, -1] = centers[absent]
     return idx

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from pnu.ops.nearest import gpu_kernels, nearest, per_cloud
+from pnu.ops.progress import Step, unheard
 from pnu.ops.thinning import farthest_in_blocks
 
 NEAR_ORIGIN_SQ = 1e-3  # the released code's threshold on |x|^2
@@ -43,7 +44,7 @@ def farthest_points(points: Tensor, m: int, *, start: int | Tensor = 0, skip_nea
     return torch.from_numpy(out)
 
 
-def farthest_points_large(points: np.ndarray | Tensor, m: int) -> np.ndarray:
+def farthest_points_large(points: np.ndarray | Tensor, m: int, *, step: Step = unheard) -> np.ndarray:
     """`farthest_points` from point 0 of one whole cloud (n, 3), in NumPy: idx (m,) int64, exactly m, all different.
 
     Beyond LARGE points it works block by block (`pnu.ops.thinning`), as evenly but from another point on, in time
@@ -53,9 +54,12 @@ def farthest_points_large(points: np.ndarray | Tensor, m: int) -> np.ndarray:
     _check_count(m, len(xyz))
     array = _float32(xyz[None])[0].numpy()
     if len(array) <= LARGE or m < len(array) // LARGE_SHARE:
-        return _farthest(array, m, 0)
+        step(0, 1)
+        chosen = _farthest(array, m, 0)
+        step(1, 1)
+        return chosen
     return farthest_in_blocks(
-        array, m, lambda part, number: _farthest(part, number, 0), threads=torch.get_num_threads()
+        array, m, lambda part, number: _farthest(part, number, 0), threads=torch.get_num_threads(), step=step
     )
 
 

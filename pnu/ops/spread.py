@@ -6,8 +6,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pnu.ops.blocks import along_curve
 from pnu.ops.frames import tangent_basis
-from pnu.ops.nearest import knn
+from pnu.ops.nearest import Search, knn
+from pnu.ops.progress import Step, unheard
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 ROWS = 2**18  # points whose neighbours are gathered at once: bounds the memory
@@ -46,24 +48,37 @@ def tangent_discs(points: Tensor, normals: Tensor, count: int, *, rank: int = RA
     return discs
 
 
-def repel(points: Tensor, normals: Tensor, *, steps: int, neighbours: int = 8) -> Tensor:
+def repel(points: Tensor, normals: Tensor, *, steps: int, neighbours: int = 8, step: Step = unheard) -> Tensor:
     """Even out the spacing: points (m, 3) push neighbours apart in their tangent planes, `steps` times.
 
     Points push each other with a force that falls to zero at about the distance that evenly spread points have, so
     a cloud does not grow beyond its border. Points of sheets that look opposite ways ignore each other.
     """
+    m, k = len(points), min(neighbours + 1, len(points))
+    parts = torch.arange(m, device=points.device).split(ROWS)
+    dist, idx = points.new_empty(m, k - 1), torch.empty(m, k - 1, dtype=torch.int32, device=points.device)
+    done, total = 0, steps * len(parts)
+    step(0, total)
+    order = along_curve(points)
+    points, normals = points[order], normals[order]
     for _ in range(steps):
-        k = min(neighbours + 1, len(points))
-        found = knn(points[None], points[None], k)
-        dist, idx = found.dist_sq[0, :, 1:].sqrt(), found.idx[0, :, 1:]
+        search = Search(points)
+        for part in parts:
+            found = search.knn(points[part], k)
+            dist[part], idx[part] = found.dist_sq[:, 1:].sqrt(), found.idx[:, 1:].int()
+            done += 1
+            step(done, total)
         radius = 1.25 * dist[:, :6].mean(1).median()
         moved = []
-        for part in torch.arange(len(points), device=points.device).split(ROWS):
-            away = points[part, None] - points[idx[part]]
-            alike = (normals[part, None] * normals[idx[part]]).sum(-1) > -0.2
+        for part in parts:
+            near = idx[part].long()
+            away = points[part, None] - points[near]
+            alike = (normals[part, None] * normals[near]).sum(-1) > -0.2
             force = (1 - dist[part] / radius).clamp(min=0) * alike / dist[part].clamp(min=1e-9 * radius)
             push = 0.5 * radius * (force[..., None] * away).sum(1)
             push = push - (push * normals[part]).sum(-1, keepdim=True) * normals[part]
             moved.append(points[part] + push * (0.3 * radius / push.norm(dim=-1, keepdim=True).clamp(min=0.3 * radius)))
         points = torch.cat(moved)
-    return points
+    back = torch.empty_like(points)
+    back[order] = points
+    return back

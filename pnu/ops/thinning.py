@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pnu.ops.blocks import Blocks, Index, split
+from pnu.ops.progress import Step, unheard
 
 BLOCK = 2**16  # points
 SURPLUS = 1.003  # points to choose, of those wanted: the last ones are dropped for an exact count
@@ -49,7 +50,13 @@ class Decline(NamedTuple):
 
 
 def farthest_in_blocks(
-    xyz: NDArray[np.float32], m: int, choose: Choose, *, threads: int = 1, size: int | None = None
+    xyz: NDArray[np.float32],
+    m: int,
+    choose: Choose,
+    *,
+    threads: int = 1,
+    size: int | None = None,
+    step: Step = unheard,
 ) -> Index:
     """m of the points (n, 3), as evenly spread as by `choose` from all at once, in about its order: (m,) indices.
 
@@ -58,16 +65,28 @@ def farthest_in_blocks(
     n = len(xyz)
     blocks = split(xyz, size or BLOCK)
     wanted = min(SURPLUS * m, n)
+    done, total = 0, 2 * len(blocks.members)
+    step(0, total)
+
+    def tick() -> None:
+        nonlocal done
+        done += 1
+        step(done, total)
+
     with ThreadPoolExecutor(threads) as pool:
 
         def first(members: Index) -> Decline:
             number = min(int(1.1 * wanted * len(members) / n) + 16, len(members))
             return _decline(xyz[members[choose(xyz[members], number)]], len(members))
 
-        declines = list(pool.map(first, blocks.members))
+        declines = []
+        for decline in pool.map(first, blocks.members):
+            declines.append(decline)
+            tick()
         reach = _common_distance(declines, wanted)
         for attempt in count():
-            chosen, distance = _choose_all(xyz, blocks, declines, reach, choose, pool)
+            total = (2 + attempt) * len(blocks.members)
+            chosen, distance = _choose_all(xyz, blocks, declines, reach, choose, pool, tick)
             surplus = len(chosen) / m
             if surplus >= 1 and (surplus <= CLOSE or attempt >= TRIES or len(chosen) == n):
                 return chosen[np.argsort(-distance, kind="stable")[:m]]
@@ -85,6 +104,7 @@ def _choose_all(
     reach: float,
     choose: Choose,
     pool: ThreadPoolExecutor,
+    tick: Callable[[], None],
 ) -> tuple[Index, NDArray[np.float64]]:
     """All points chosen down to a distance, and how far each was from those chosen before it."""
     none = np.empty(0, np.int64)
@@ -127,6 +147,7 @@ def _choose_all(
             waiting[blocks.members[number]] = False
         for number, (idx, far) in zip(group, pool.map(work, group), strict=True):
             chosen[number], distance[number] = idx, far
+            tick()
 
     def fill(number: int) -> tuple[Index, NDArray[np.float64]]:
         """Holes at the borders, where a block relied on points of a neighbour's that were not chosen in the end."""

@@ -24,10 +24,12 @@ def spread(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result
         with torch.no_grad():  # the mode is each thread's own
             return work(part)
 
-    if min(threads, len(parts)) <= 1:
+    if threads == 1:
         return [quiet(part) for part in parts]
-    torch.set_num_threads(1)
+    torch.set_num_threads(1)  # for a single part too: its last digits are those that it has among others
     try:
+        if len(parts) == 1:
+            return [quiet(parts[0])]
         return list(_pool(threads, os.getpid()).map(quiet, parts))
     finally:
         torch.set_num_threads(threads)
