@@ -28,7 +28,7 @@ EACH = 3  # seeds of a point, in training, before they are thinned out
 PUSH = 0.1  # between rounds of training, beside the way from its point to a seed
 SMOOTH = 0.1  # noise in spacings from which on a cloud is smoothed first
 KEPT = 2**19  # queries whose projections are kept in one file
-BATCHES = 32  # on a CPU, that its threads share
+BATCHES = 64  # on a CPU, that its threads share
 DENSE = 16  # neighbours that are all looked at; farther ones are thinned out
 
 
@@ -267,7 +267,7 @@ class Surface(nn.Module):
     @staticmethod
     def batch(cloud: Tensor, batch_size: int | None) -> int:
         """Queries at once."""
-        return batch_size or (512 if cloud.device.type == "cpu" else 2**16)
+        return batch_size or (256 if cloud.device.type == "cpu" else 2**16)
 
 
 def noise_in_spacings(cloud: Tensor) -> float:
