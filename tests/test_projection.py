@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pnu.models.surface import Projector, Surface
+from pnu.models.surface import Projector, Surface, spared
 from pnu.ops.frames import local_frames, tangent_basis
 from pnu.ops.spread import repel, tangent_discs
 from pnu.ops.transforms import rotation_matrix
@@ -211,8 +211,8 @@ def test_parts_can_be_left_out() -> None:
 
 def test_most_doubtful_points_are_dropped() -> None:
     model, cloud = trained(), wavy(300)
-    model.reject = 0.5
     every = {}
+    model.reject = 0.01
     project = model.in_parts
 
     def spy(query: Tensor, cloud: Tensor, **options: Any) -> tuple[Tensor, Tensor]:
@@ -222,10 +222,29 @@ def test_most_doubtful_points_are_dropped() -> None:
     model.in_parts = spy  # type: ignore[method-assign]
     dense = model.upsample_cloud(cloud, 600)
     points, error = every["last"]
-    assert len(points) == 900
+    assert len(points) == 606
     kept = torch.isin(points[:, 0], dense[:, 0])
     assert kept.sum() == 600
-    assert error[kept].max() <= error[~kept].min()
+    assert error[~kept].min() > error.median()
+    dropped = points[~kept, :3]
+    assert torch.pdist(dropped).min() > torch.cdist(dropped, points[:, :3]).sort(1).values[:, 4].min()
+
+
+def test_of_doubtful_neighbours_the_worst_is_dropped() -> None:
+    """A row of bad points does not become a hole, and a bad point elsewhere does not stay for their sake."""
+    x, y = torch.meshgrid(torch.arange(20.0), torch.arange(20.0), indexing="ij")
+    grid = torch.stack([x, y, torch.zeros_like(x)], -1).flatten(0, 1)
+    error = torch.zeros(400)
+    error[105:110], error[300] = torch.tensor([7.0, 8.0, 9.0, 8.5, 7.5]), 5.0
+    stays = spared(grid, error, 398)
+    assert sorted(set(range(400)) - set(stays.tolist())) == [107, 300]
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, 19, 20])
+def test_count_is_exact_however_many_are_dropped(count: int) -> None:
+    stays = spared(sphere(20)[:, :3], torch.arange(20.0).flip(0), count)
+    assert len(stays) == count
+    assert stays.equal(stays.unique())
 
 
 def test_noisy_points_are_smoothed_first() -> None:

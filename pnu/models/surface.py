@@ -9,7 +9,7 @@ from functools import partial
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import normalize
+from torch.nn.functional import linear, normalize
 
 from pnu.ops import threads
 from pnu.ops.blocks import along_curve
@@ -29,6 +29,8 @@ PUSH = 0.1  # between rounds of training, beside the way from its point to a see
 SMOOTH = 0.1  # noise in spacings from which on a cloud is smoothed first
 KEPT = 2**19  # queries whose projections are kept in one file
 BATCHES = 64  # on a CPU, that its threads share
+AROUND = 8  # points of which one at most is dropped,
+DOUBTFUL = 16  # looked for among so many for each point to drop
 DENSE = 16  # neighbours that are all looked at; farther ones are thinned out
 
 
@@ -41,7 +43,7 @@ class Projector(nn.Module):
         self.first, self.second = nn.Linear(FEATURES, width), nn.Linear(width, width)
         self.context = nn.Linear(2 * width + 1, width)
         self.third = nn.Linear(width, width)
-        self.attention = nn.Linear(width, width + 2)
+        self.attention = nn.Linear(width, width + 2, bias=False)  # a bias changes no share
         self.head = nn.Sequential(nn.Linear(3 * width, 2 * width), nn.ReLU(), nn.Linear(2 * width, width), nn.ReLU())
         self.out = nn.Linear(width, 7)
         nn.init.zeros_(self.out.weight)
@@ -53,15 +55,18 @@ class Projector(nn.Module):
         step (m, 3), unit normal (m, 3), logarithm of the expected error in spacings (m,), spacing (m, 1)."""
         with torch.no_grad():
             frame = local_frames(offsets, normals, hint, sphere=self.sphere)
-        y = self.second(self.first(frame.features).relu()).relu()
+        y = self.second(self.first(frame.features).relu_()).relu_()
         context = self.context(torch.cat([y.amax(1), (self.shares(y) * y).sum(1), frame.height], -1))
-        y = (self.third(y) + context[:, None]).relu()
-        share = self.shares(self.attention(y))
-        out = self.out(self.head(torch.cat([y.amax(1), (share[..., :-2] * y).sum(1), context], -1)))
+        # the bias is added to the few contexts, not to the many neighbours
+        y = linear(y, self.third.weight).add_((context + self.third.bias)[:, None]).relu_()
+        of_features, of_choices = self.attention.weight.split([y.shape[-1], 2])
+        seen = (self.shares(linear(y, of_features)) * y).sum(1)
+        choice = self.shares(linear(y, of_choices))
+        out = self.out(self.head(torch.cat([y.amax(1), seen, context], -1)))
         # beside what the network finds freely, it chooses among the neighbours' normals and their bent planes
-        bent = (share[..., -1] * frame.features[..., 7]).sum(1)
+        bent = (choice[..., 1] * frame.features[..., 7]).sum(1)
         step = torch.cat([out[:, :2], (out[:, 2] + 0.5 * bent)[:, None]], 1)
-        normal = (share[..., -2:-1] * frame.features[..., 3:6]).sum(1) + out[:, 3:6]
+        normal = (choice[..., :1] * frame.features[..., 3:6]).sum(1) + out[:, 3:6]
         step, normal = ((v[:, None] @ frame.axes)[:, 0] for v in (step, normal))
         return frame.base + frame.spacing * step, normalize(normal, dim=-1), out[:, 6], frame.spacing
 
@@ -83,7 +88,8 @@ class Surface(nn.Module):
         candidates: seeds for each point wanted after they were thinned out to an even spacing.
         relaxation: steps of even spacing.
         refinements: projections after it; one more is nearer to the surface and a little less even.
-        reject: share of the points that is made too many; those with the highest expected error are dropped in the end.
+        reject: share of the points that is made too many; the worst of
+            their surroundings by expected error are dropped in the end.
         queries: seeds of a crop, in training.
         sphere: start from the sphere that fits the neighbours (algebraic point set surface), not from the seed.
         attention: weigh the neighbours; without it all count alike.
@@ -206,7 +212,7 @@ class Surface(nn.Module):
             query = keep("even", lambda: evened(query, self.relaxation, partial(progress, "even spacing"))).to(cloud)
         for i in range(self.refinements):
             query, error = run(query, cloud, stage=f"refinement {i + 1}")
-        return query[error.argsort(stable=True)[:count].sort().values]
+        return query[spared(query[:, :3], error, count)]
 
     def in_parts(
         self,
@@ -288,6 +294,21 @@ def seeds_around(cloud: Tensor, each: int, count: int, step: Step = unheard) -> 
         kept = torch.from_numpy(farthest_points_large(places, count, step=step)).to(cloud.device)
     owner = torch.where(kept < len(cloud), kept, (kept - len(cloud)) // each)
     return torch.cat([places[kept], cloud[owner, 3:]], 1)
+
+
+def spared(points: Tensor, error: Tensor, count: int) -> Tensor:
+    """Indices (count,), ascending, of the points (m, 3) that stay when those of the highest error (m,) are dropped.
+
+    Of neighbours only the worst goes, as long as there are others to drop: a bad point without its surroundings would
+    be a hole.
+    """
+    surplus = len(points) - count
+    doubtful = error.argsort(descending=True, stable=True)[: DOUBTFUL * surplus]
+    around = knn(points[None, doubtful], points[None], min(AROUND, len(points))).idx[0]
+    worst = error[doubtful] >= error[around].amax(1)
+    stays = torch.ones_like(error, dtype=torch.bool)
+    stays[torch.cat([doubtful[worst], doubtful[~worst]])[:surplus]] = False
+    return stays.nonzero()[:, 0]
 
 
 def evened(cloud: Tensor, steps: int, step: Step = unheard) -> Tensor:
