@@ -62,8 +62,9 @@ def evaluate(cfg: Any) -> None:
     is_run = not cfg.method and Path(subject).is_dir()
     name = Path(subject).name if is_run else Path(subject).stem
     default = Path(subject, "evaluation") if is_run else Path("outputs", "evaluation", name)
-    output = evaluation.result_folder(cfg.output or default / source.name)
-    clouds = evaluation.result_folder(output / "clouds") if cfg.save else None
+    within = subject if is_run and not cfg.output else None
+    output = evaluation.result_folder(cfg.output or default / source.name, within)
+    clouds = evaluation.result_folder(output / "clouds", within) if cfg.save else None
 
     def keep(case: evaluation.Case, method: str, cloud: Any) -> None:
         if clouds:

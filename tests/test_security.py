@@ -1,9 +1,10 @@
 """Files from strangers: nothing that they hold is run."""
 
 import os
+import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import h5py
@@ -12,10 +13,11 @@ import pytest
 import torch
 import yaml
 
-import pnu
-from pnu import checkpoint
-from pnu.data import patchset
+import pnu.io
+from pnu import checkpoint, evaluate
+from pnu.data import patchset, shapes
 from pnu.models import build
+from tests.commands import refused
 
 PNU = {"_target_": "pnu.models.pnu.PNU", "ratio": 2, "local_features": False}
 Attack = Callable[[Path, Path], None]
@@ -40,6 +42,19 @@ def target(name: str) -> Attack:
     return attack
 
 
+def argument(key: str, value: Callable[[Path], object]) -> Attack:
+    """A network of ours with an argument that Hydra would run or resolve."""
+
+    def attack(run: Path, mark: Path) -> None:
+        (run / "config.yaml").write_text(yaml.safe_dump({"model": PNU | {key: value(mark)}}))
+
+    return attack
+
+
+def mkdir(mark: Path) -> dict[str, object]:
+    return {"_target_": "os.mkdir", "_args_": [str(mark)], "_partial_": False}
+
+
 def tag(run: Path, mark: Path) -> None:
     (run / "config.yaml").write_text(f"model: !!python/object/apply:os.mkdir ['{mark}']")
 
@@ -56,6 +71,10 @@ ATTACKS = {
     "another package of that prefix": target("pnu.models_evil.Network"),
     "what a module of ours imports": target("pnu.models.layers.torch.os.system"),
     "a class that a module of ours imports": target("pnu.models.layers.nn.Module"),
+    "a class among the arguments": argument("ratio", mkdir),
+    "a class among arguments that no network has": argument("more", mkdir),
+    "a call that waits for arguments": argument("_partial_", lambda mark: True),
+    "a variable of the environment": argument("ratio", lambda mark: "${oc.env:HOME}"),
     "YAML tag": tag,
     "pickle": pickled,
 }
@@ -78,7 +97,7 @@ def upsample(run: Path) -> subprocess.CompletedProcess[str]:
 def test_load_runs_nothing(run: Path, name: str) -> None:
     mark = run.parent / "mark"
     ATTACKS[name](run, mark)
-    with pytest.raises(ValueError, match=r"config.yaml|best.ckpt|model._target_") as error:
+    with pytest.raises(ValueError, match=r"config.yaml|best.ckpt|^model") as error:
         pnu.load(run)
     assert "\n" not in str(error.value)
     assert not mark.exists()
@@ -109,23 +128,75 @@ def test_npy_is_read_without_pickle(tmp_path: Path) -> None:
     assert not mark.exists()
 
 
-@pytest.mark.parametrize("kind", ["link", "storage", "virtual"])
-def test_a_patch_file_reads_no_other_file(tmp_path: Path, kind: str) -> None:
-    cloud = np.zeros((2, 64, 6), np.float32)
-    cloud[..., 3] = 1
-    with h5py.File(tmp_path / "private.h5", "w") as file:
-        file["poisson_4096"] = cloud
-    cloud.tofile(tmp_path / "private.bin")
+def test_what_belongs_to_other_commands_is_left_alone(run: Path) -> None:
+    """Groups beside the network's: trainings are not built, Hydra is not set up."""
+    evil = mkdir(run.parent / "mark")
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    config |= {"hydra": {"launcher": evil, "callbacks": {"evil": evil}}, "callbacks": {"evil": evil}, "trainer": evil}
+    (run / "config.yaml").write_text(yaml.safe_dump(config | {"optimizer": evil | {"_partial_": True}}))
+    assert pnu.load(run).ratio == 2
+    assert not (run.parent / "mark").exists()
+
+
+@pytest.fixture
+def trap(tmp_path: Path) -> Iterator[Path]:
+    """A name that, opened, waits for ever: for five seconds here."""
+
+    def stop(*_: object) -> None:
+        raise TimeoutError("the other file was opened")
+
+    os.mkfifo(tmp_path / "trap")
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(5)
+    yield tmp_path / "trap"
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize("kind", ["link", "soft", "storage", "virtual", "aside"])
+def test_a_patch_file_opens_no_other_file(tmp_path: Path, trap: Path, kind: str) -> None:
+    cloud = np.tile(np.float32([0, 0, 0, 1, 0, 0]), (2, 64, 1))
+    cloud[..., :3] = np.random.default_rng(0).random((2, 64, 3))
     with h5py.File(tmp_path / "patches.h5", "w") as file:
         file["padding"] = np.zeros(100_000, np.uint8)
+        outside = h5py.ExternalLink(str(trap), "poisson_4096")
         if kind == "link":
-            file["poisson_4096"] = h5py.ExternalLink("private.h5", "poisson_4096")
+            file["poisson_4096"] = outside
+        elif kind == "soft":
+            file["outside"], file["poisson_4096"] = outside, h5py.SoftLink("/outside")
         elif kind == "storage":
-            stored = [(str(tmp_path / "private.bin"), 0, cloud.nbytes)]
-            file.create_dataset("poisson_4096", cloud.shape, cloud.dtype, external=stored)
-        else:
+            file.create_dataset("poisson_4096", cloud.shape, cloud.dtype, external=[(str(trap), 0, cloud.nbytes)])
+        elif kind == "virtual":
             layout = h5py.VirtualLayout(cloud.shape, cloud.dtype)
-            layout[...] = h5py.VirtualSource(tmp_path / "private.h5", "poisson_4096", cloud.shape)
+            layout[...] = h5py.VirtualSource(trap, "poisson_4096", cloud.shape)
             file.create_virtual_dataset("poisson_4096", layout)
-    with pytest.raises(ValueError, match=r"patches\.h5: poisson_4096 lies in another file"):
+        else:
+            file["poisson_4096"], file["outside"] = cloud, outside
+    if kind == "aside":
+        assert "outside (a link)" in patchset.describe(tmp_path / "patches.h5")["datasets"]
+        return
+    with pytest.raises(ValueError, match=r"patches\.h5: poisson_4096 is a link or lies in another file"):
         patchset.check(tmp_path / "patches.h5")
+
+
+@pytest.mark.parametrize("name", ["mesh.obj", "mesh.ply"])
+def test_a_mesh_opens_no_other_file(tmp_path: Path, trap: Path, name: str) -> None:
+    """Materials and textures beside it, or anywhere."""
+    mesh = shapes.make("mug")
+    pnu.io.write_mesh(tmp_path / name, mesh)
+    text = (tmp_path / name).read_bytes()
+    if name == "mesh.obj":
+        text = f"mtllib {trap}\ncall {trap}\nusemtl x\n".encode() + text
+    else:
+        text = text.replace(b"element vertex", f"comment TextureFile {trap}\nelement vertex".encode(), 1)
+    (tmp_path / name).write_bytes(text)
+    assert len(pnu.io.read_mesh(tmp_path / name).faces) == len(mesh.faces)
+
+
+def test_results_stay_in_the_run_folder(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A stranger's run folder may hold links."""
+    (run.parent / "private").mkdir()
+    (run / "evaluation").symlink_to(run.parent / "private")
+    line = [f"run={run}", "shapes=[mug]", "kinds=[uniform]", "points=64", "truth_points=150", "ratio=2"]
+    assert "a link leads out of" in refused(capsys, evaluate.main, line)
+    assert list((run.parent / "private").iterdir()) == []

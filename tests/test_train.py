@@ -347,6 +347,17 @@ def test_a_strangers_key_is_refused(finished: Path, tmp_path: Path, capsys: pyte
     assert "unknown key 'model.command'" in refused(capsys, main, [f"run={run}", "resume=true"])
 
 
+def test_a_strangers_config_reads_no_variable_of_the_environment(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    (run / "config.yaml").write_text(
+        (run / "config.yaml").read_text().replace("name: ", 'name: "\\x24{oc.env:HOME}" # ')
+    )
+    assert "expected plain values" in refused(capsys, main, [f"run={run}", "resume=true"])
+
+
 # --- failures ---
 
 

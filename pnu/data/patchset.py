@@ -216,14 +216,22 @@ def contents_of(path: Path, file: h5py.File) -> Contents:
 
 def dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset | None:
     """A dataset of the file itself; ValueError where the file is far too small for the size that it claims."""
-    found = file.get(name)
+    if not file.id.links.exists(name.encode()):
+        return None
+    # a file from elsewhere reads no other one here; what a link leads to is not even opened
+    found = file.get(name) if is_own(file, name) else None
+    if found is None or (isinstance(found, h5py.Dataset) and (found.external or found.is_virtual)):
+        raise ValueError(f"{path}: {name} is a link or lies in another file; copy its numbers into this one")
     if not isinstance(found, h5py.Dataset):
         return None
-    if found.file != file or found.external or found.is_virtual:  # a file from elsewhere reads no other one here
-        raise ValueError(f"{path}: {name} lies in another file; copy its numbers into this one")
     if found.shape is None or found.size * found.dtype.itemsize > DENSEST * path.stat().st_size:
         raise ValueError(f"{path}: {name} claims the shape {found.shape}, more than the file can hold; it is damaged")
     return found
+
+
+def is_own(file: h5py.File, name: str) -> bool:
+    """Whether an entry of a file is its own, and no link that may lead to another file."""
+    return file.id.links.get_info(name.encode()).type == h5py.h5l.TYPE_HARD
 
 
 def parameters_of(file: h5py.File) -> dict[str, Any]:
@@ -236,13 +244,13 @@ def parameters_of(file: h5py.File) -> dict[str, Any]:
 
 
 def listing(file: h5py.File) -> str:
-    items = (
-        f"{name} {item.shape} {'text' if item.dtype.kind in 'OS' else item.dtype}"
-        if isinstance(item, h5py.Dataset)
-        else f"{name} (a group)"
-        for name, item in file.items()
-    )
-    return ", ".join(items) or "nothing"
+    def told(name: str) -> str:
+        item = file[name] if is_own(file, name) else "a link"
+        if isinstance(item, h5py.Dataset):
+            return f"{name} {item.shape} {'text' if item.dtype.kind in 'OS' else item.dtype}"
+        return f"{name} ({'a group' if isinstance(item, h5py.Group) else item})"
+
+    return ", ".join(map(told, file)) or "nothing"
 
 
 def names_of(path: Path, file: h5py.File, patches: int) -> list[str] | None:

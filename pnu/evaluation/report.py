@@ -119,9 +119,12 @@ def write_results(folder: str | Path, rows: Sequence[Row], head: Mapping[str, An
     write_json(folder / "metrics.json", content)
 
 
-def result_folder(path: str | Path) -> Path:
-    """The folder, made where it is not there yet; ValueError if files cannot be written to it."""
+def result_folder(path: str | Path, within: str | Path | None = None) -> Path:
+    """The folder, made where it is not there yet; ValueError if files cannot be written to it, or if a link leads
+    out of the folder `within`."""
     path = Path(path)
+    if within is not None and not path.resolve().is_relative_to(Path(within).resolve()):
+        raise ValueError(f"{path}: a link leads out of {within}, to {path.resolve()}; give output=FOLDER")
     try:
         path.mkdir(parents=True, exist_ok=True)
         check_writable(path / "metrics.json")

@@ -1,5 +1,6 @@
 """Open the run folder of a training: a new one, or the one to go on with."""
 
+import json
 import os
 import shlex
 from collections.abc import Sequence
@@ -85,7 +86,10 @@ def restored(run: RunFolder, config: dict[str, Any], overrides: Sequence[str], s
     from yaml import YAMLError
 
     try:
-        saved = check(OmegaConf.load(run.config), schema)
+        written = OmegaConf.load(run.config)
+        if "${" in json.dumps(OmegaConf.to_container(written), default=str):  # it could ask for ${oc.env:SECRET}
+            raise ValueError(f"{run.config}: expected plain values, found ${{...}}; write out what it stands for")
+        saved = check(written, schema)
     except (OmegaConfBaseException, YAMLError, AttributeError, TypeError, RecursionError) as error:
         raise ValueError(f"{run.config}: expected the config of a run, found {' '.join(str(error).split())}") from None
     for key in config.keys() - saved.keys():  # of a later version than the run's
