@@ -19,3 +19,10 @@ def shared() -> Path:
     if not (folder / "reference").is_dir():
         pytest.skip("reference material (../shared) is not here")
     return folder
+
+
+@pytest.fixture
+def untraced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands run without coverage, which slows them down, writes a file, and which Hydra takes for a debugger."""
+    monkeypatch.delenv("COVERAGE_PROCESS_CONFIG", raising=False)
+    monkeypatch.setattr("hydra._internal.utils.is_under_debugger", lambda: False)

@@ -123,6 +123,7 @@ def test_a_multirun_leaves_a_complete_folder_for_each_value(tmp_path: Path, smal
     assert any(not torch.equal(first[name], second[name]) for name in first)
 
 
+@pytest.mark.usefixtures("untraced")
 def test_a_failed_job_leaves_the_others_and_a_record(tmp_path: Path, small: list[str]) -> None:
     done = train(tmp_path, *small, "-m", "model.ratio=3,4", "trainer.max_steps=1", "quiet=true")
     assert done.returncode != 0
@@ -154,6 +155,7 @@ def test_killed_and_resumed_as_if_never_stopped(tmp_path: Path, small: list[str]
     assert not list((tmp_path / "killed").rglob(".*")), "a temporary file was left"
 
 
+@pytest.mark.usefixtures("untraced")
 def test_interrupted_by_hand(tmp_path: Path, small: list[str]) -> None:
     """Ctrl-C: the record says so, and the last line how to go on."""
     process = start(tmp_path, *small, "callbacks.checkpoints.every_n_steps=1", f"run={tmp_path / 'run'}")

@@ -15,6 +15,7 @@ def check(results: list[dict], readers: int, cases: int) -> None:
         assert 0 < result["refused"] < result["cases"], "some are damaged, some are not"
 
 
+@pytest.mark.usefixtures("untraced")
 def test_a_few_cases_of_every_reader(tmp_path: Path) -> None:
     readers = [name for name in READERS if name != "laz"]  # which takes a process a case
     check(fuzz(readers, 18, 7, tmp_path), len(readers), 18)  # 270 in all

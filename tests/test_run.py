@@ -244,6 +244,7 @@ def test_bad_input_is_one_line_and_exit_code_2(script: Any, arguments: list[str]
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.usefixtures("untraced")
 def test_in_a_multirun_the_other_jobs_go_on(script: Any) -> None:
     done = script("-m", "input=a", "output=b", "ratio=0.5,2")
     assert done.returncode != 0

@@ -277,6 +277,7 @@ def test_a_job_that_runs_is_left_alone(
 # --- failures ---
 
 
+@pytest.mark.usefixtures("untraced")
 def test_a_failing_job_is_told_at_once_and_the_others_go_on(
     patch_file: Path,  # noqa: F811
     tmp_path: Path,
@@ -364,6 +365,38 @@ def test_a_search_goes_on_from_its_storage(
     assert records(folder) == before
     front = yaml.safe_load((folder / "optimization_results.yaml").read_text())["solutions"]
     assert 1 <= len(front) <= 2
+
+
+def test_what_is_left_of_a_search(tmp_path: Path) -> None:
+    """Ended trials count, one that was interrupted comes again with its values, the seed moves on."""
+    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
+    import optuna
+    from omegaconf import OmegaConf
+
+    from pnu.run.search import arguments
+
+    storage = f"sqlite:///{tmp_path}/optuna.db"
+    sweeper = {
+        "_target_": "OptunaSweeper",
+        "storage": storage,
+        "study_name": "s",
+        "n_trials": 5,
+        "sampler": {"seed": 7},
+    }
+    hydra = OmegaConf.create({"sweeper": sweeper})
+    assert arguments(hydra) == [], "nothing has begun"
+    study = optuna.create_study(storage=storage, study_name="s")
+    for value in (1.0, 2.0):
+        trial = study.ask()
+        trial.suggest_float("lr", 0, 1)
+        study.tell(trial, value)
+    lost = study.ask()
+    lost.suggest_float("lr", 0, 1)
+    assert arguments(hydra) == ["hydra.sweeper.n_trials=3", "hydra.sweeper.sampler.seed=9"]
+    study = optuna.load_study(storage=storage, study_name="s")
+    assert study.trials[2].state == optuna.trial.TrialState.FAIL
+    assert study.ask().suggest_float("lr", 0, 1) == lost.params["lr"]
+    assert arguments(OmegaConf.create({"sweeper": {"_target_": "BasicSweeper"}})) == []
 
 
 @pytest.mark.slow
