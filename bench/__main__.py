@@ -58,6 +58,8 @@ def main() -> None:
     parser.add_argument("parts", nargs="*", help=f"of {' '.join([*PARTS, 'scale'])}; default: all")
     parser.add_argument("--threads", type=int, default=2, help="of torch (default: 2)")
     parser.add_argument("--points", type=int, nargs="+", default=scale.SHORT, help="sizes of the scale curve")
+    parser.add_argument("--models", nargs="+", default=["surface"], help="of the scale curve: surface pnu ...")
+    parser.add_argument("--keep", action="store_true", help="the last dense cloud of the curve, as ply in the folder")
     parser.add_argument("--folder", type=Path, default=Path("outputs/bench"), help="for table and plot")
     arguments = parser.parse_args()
     unknown = set(arguments.parts) - {*PARTS, "scale"}
@@ -77,7 +79,8 @@ def main() -> None:
     profile = step.profile() if "step" in wanted else None
     if profile:
         notes += ["", *profile.lines()]
-    curve = scale.curve(arguments.points, arguments.threads) if "scale" in wanted else []
+    keep = arguments.folder if arguments.keep else None
+    curve = scale.curve(arguments.points, arguments.threads, arguments.models, keep) if "scale" in wanted else []
     if curve:
         notes += ["", *scale.lines(curve)]
         scale.plot(curve, arguments.folder / "scale.png")

@@ -5,29 +5,43 @@ import math
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import torch
+from torch import nn
+
+from pnu import weights
+from pnu.models.pnu import PNU
 
 SHORT = [10_000, 30_000, 100_000]
 FULL = [*SHORT, 300_000, 1_000_000]
 RUN = """
 import json, re, sys, time
 from pathlib import Path
-from bench.scale import wavy_sphere
+from bench.scale import network, wavy_sphere
 from pnu.inference import upsample
-n, model = int(sys.argv[1]), sys.argv[2]
-cloud = wavy_sphere(n)
+from pnu.io import write_cloud
+n, name, kept = int(sys.argv[1]), sys.argv[2], sys.argv[3]
+cloud, model = wavy_sphere(n), network(name)
+normals = None if name == "surface_estimated" else cloud[:, 3:]
 upsample(cloud[:2000, :3], cloud[:2000, 3:], model=model)
+begun = {}
 status = lambda name: int(re.search(name + r":\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) / 2**20
 Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
 before, started = status("VmRSS"), time.perf_counter()
-dense = upsample(cloud[:, :3], cloud[:, 3:], model=model)
+say = lambda stage, done, total: begun.setdefault(stage.split(",")[0], time.perf_counter() - started)
+dense = upsample(cloud[:, :3], normals, model=model, progress=say)
 seconds = time.perf_counter() - started
 assert dense.shape == (4 * n, 6)
 clouds = (cloud.nbytes + dense.nbytes) / 2**30
-print(json.dumps([seconds, status("VmHWM") - before - dense.nbytes / 2**30, clouds]))
+beyond = status("VmHWM") - before - dense.nbytes / 2**30
+ends = [*list(begun.values())[1:], seconds]
+print(json.dumps([seconds, beyond, clouds, {stage: end - begun[stage] for stage, end in zip(begun, ends)}]))
+if kept:
+    write_cloud(kept, dense[:, :3], dense[:, 3:])
 """
 
 
@@ -39,6 +53,15 @@ class Point(NamedTuple):
     seconds: float
     beyond_gib: float
     clouds_gib: float
+    stages: dict[str, float]  # seconds
+
+
+def network(name: str) -> str | nn.Module:
+    """Weights that ship, or the paper's network as it begins: with offsets, so that points lie near the surface."""
+    if name in weights.names():
+        return name
+    torch.manual_seed(0)
+    return PNU(residual=True)
 
 
 def wavy_sphere(n: int) -> np.ndarray:
@@ -53,15 +76,18 @@ def wavy_sphere(n: int) -> np.ndarray:
     return np.hstack([radius * x, normals / np.linalg.norm(normals, axis=1, keepdims=True)])
 
 
-def curve(sizes: list[int], threads: int, models: tuple[str, ...] = ("surface",)) -> list[Point]:
+def curve(
+    sizes: list[int], threads: int, models: Sequence[str] = ("surface",), keep: Path | None = None
+) -> list[Point]:
+    """keep: folder for the last of the results."""
     found = []
     environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
     for model in models:
         for n in sizes:
-            command = [sys.executable, "-c", RUN, str(n), model]
+            kept = str(keep / f"{model}_{n}.ply") if keep and n == sizes[-1] else ""
+            command = [sys.executable, "-c", RUN, str(n), model, kept]
             done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
-            seconds, beyond, clouds = json.loads(done.stdout)
-            found.append(Point(n, model, seconds, beyond, clouds))
+            found.append(Point(n, model, *json.loads(done.stdout)))
             print(found[-1], flush=True)
     return found
 
@@ -80,6 +106,9 @@ def lines(curve: list[Point]) -> list[str]:
     for model in dict.fromkeys(point.model for point in curve):
         slope = exponent([point for point in curve if point.model == model])
         text += ["", f"time of {model} grows with the number of points to the power {slope:.2f}"]
+        last = [point for point in curve if point.model == model][-1]
+        shares = [f"{stage} {100 * seconds / last.seconds:.0f} %" for stage, seconds in last.stages.items()]
+        text += ["", f"where it goes at {last.points} points: {', '.join(shares)}"]
     return text
 
 
