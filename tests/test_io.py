@@ -444,3 +444,12 @@ def test_hidden_files_are_no_meshes(tmp_path: Path) -> None:
     assert meshes_of(tmp_path) == {"a": tmp_path / "a.ply", "b_c": tmp_path / "b/c.off"}
     remove_leftovers(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["._a.ply", "a.ply", "b", "notes.txt"]
+
+
+@pytest.mark.parametrize("with_normals", [False, True])
+def test_npy_in_slices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, with_normals: bool) -> None:
+    monkeypatch.setattr("pnu.io.cloud.SLICE", 7)
+    cloud = np.random.default_rng(0).normal(size=(40, 6))
+    cloud[:, 3:] /= np.linalg.norm(cloud[:, 3:], axis=1, keepdims=True)
+    write_cloud(tmp_path / "a.npy", cloud[:, :3], cloud[:, 3:] if with_normals else None)
+    np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), cloud if with_normals else cloud[:, :3])

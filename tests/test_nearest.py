@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from pnu.ops import nearest as module
-from pnu.ops.nearest import ball_query, knn, nearest
+from pnu.ops.nearest import Search, ball_query, knn, nearest
 from tests import reference
 
 DTYPES = [torch.float32, torch.float64]
@@ -141,3 +141,16 @@ def test_gpu_finds_what_the_cpu_finds(k: int) -> None:
     assert torch.equal(cpu.idx, gpu.idx.cpu())
     torch.testing.assert_close(cpu.dist_sq, gpu.dist_sq.cpu())
     assert torch.equal(ball_query(query, target, 0.2, 32), ball_query(query.cuda(), target.cuda(), 0.2, 32).cpu())
+
+
+def test_a_search_again_and_again() -> None:
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(50, 3, generator=generator, dtype=torch.float64)
+    search = Search(target)
+    for m, k in ((1, 1), (30, 7), (4, 50)):
+        query = torch.rand(m, 3, generator=generator, dtype=torch.float64)
+        found, expected = search.knn(query, k), knn(query[None], target[None], k)
+        torch.testing.assert_close(found.idx, expected.idx[0], rtol=0, atol=0)
+        torch.testing.assert_close(found.dist_sq, expected.dist_sq[0], rtol=0, atol=0)
+    with pytest.raises(ValueError, match="k: expected 1 to 50 neighbours"):
+        search.knn(target, 51)

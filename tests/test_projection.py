@@ -279,3 +279,20 @@ def test_training_seeds_are_spread_and_pushed_outward() -> None:
     assert apart.min() > 2 * crowded.min()
     parents = seeds[0, :, :3] - push[0, :, :3] / 0.1
     assert torch.cdist(parents, patch[0, :20, :3]).amin(1).max() < 1e-4
+
+
+def test_every_stage_of_a_large_run_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    from pnu.models import surface
+    from pnu.ops import sampling, spread, thinning
+
+    monkeypatch.setattr(surface, "BATCHES", 1)
+    monkeypatch.setattr(sampling, "LARGE", 2000)
+    monkeypatch.setattr(thinning, "BLOCK", 1000)
+    monkeypatch.setattr(spread, "ROWS", 1000)
+    steps: dict[str, list[tuple[int, int]]] = {}
+    Surface().upsample_cloud(sphere(600), 2400, progress=lambda stage, *step: steps.setdefault(stage, []).append(step))
+    assert list(steps) == ["seeds", "projection", "thinning", "even spacing", "refinement 1", "refinement 2"]
+    for stage, told in steps.items():
+        done, total = zip(*told, strict=True)
+        assert len(set(done)) > 4, stage
+        assert max(done) == done[-1] == total[-1]

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from pnu.ops import sampling
-from pnu.ops.blocks import split
+from pnu.ops.blocks import along_curve, split
 from pnu.ops.sampling import farthest_points_large
 from pnu.ops.thinning import farthest_in_blocks
 
@@ -108,3 +108,22 @@ def test_large_clouds_take_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(np.unique(chosen)) == 3000
     assert spacing(points[chosen]).mean() == pytest.approx(spacing(points[exact]).mean(), rel=0.01)
     np.testing.assert_array_equal(farthest_points_large(points, 100), exact[:100])  # too few for blocks
+
+
+def test_the_way_is_told() -> None:
+    points, steps = sphere(20_000), []
+    farthest_in_blocks(points, 5000, choose, size=SIZE, threads=2, step=lambda *step: steps.append(step))
+    done, totals = zip(*steps, strict=True)
+    assert list(done) == list(range(len(done)))
+    assert done[-1] == totals[-1] >= 2 * len(split(points, SIZE).members)
+    assert list(totals) == sorted(totals)
+
+
+def test_near_along_the_curve_is_near_in_space() -> None:
+    points = torch.from_numpy(sphere(20_000)).double() * 7 + 1e5
+    order = along_curve(points)
+    assert torch.equal(order.sort().values, torch.arange(len(points)))
+    steps = points[order].diff(dim=0).norm(dim=1)
+    apart = cKDTree(points).query(points, k=2)[0][:, 1].mean()
+    assert steps.median() < 3 * apart  # of a random order: about 7
+    torch.testing.assert_close(along_curve(points[:1].expand(5, 3)), torch.arange(5))

@@ -10,7 +10,7 @@ from pnu.io.atomic import atomic_path, check_writable
 from pnu.io.las import read_las, write_las
 from pnu.io.mesh import Geometry, as_colors, ply_normals, read_obj, read_off, write_obj, write_off, xyz_columns
 from pnu.io.pcd import read_pcd, write_pcd
-from pnu.io.ply import read_ply, write_ply
+from pnu.io.ply import SLICE, read_ply, write_ply
 from pnu.io.text import known_suffix, open_file, table, text_lines
 
 LARGEST = 1e30  # beyond, squared distances leave the range of float64 or what float32 can hold after scaling
@@ -272,7 +272,12 @@ def _write_pcd(path: Path, cloud: Cloud) -> None:
 
 
 def _write_npy(path: Path, cloud: Cloud) -> None:
-    np.save(path, _joined(cloud), allow_pickle=False)
+    columns = [cloud.points] if cloud.normals is None else [cloud.points, cloud.normals]
+    shape = (len(cloud.points), 3 * len(columns))
+    with path.open("wb") as handle:
+        np.lib.format.write_array_header_1_0(handle, {"descr": "<f8", "fortran_order": False, "shape": shape})
+        for start in range(0, len(cloud.points), SLICE):
+            np.hstack([values[start : start + SLICE] for values in columns]).astype("<f8").tofile(handle)
 
 
 def _write_geometry(write: Callable[[Path, Geometry], None]) -> Callable[[Path, Cloud], None]:
