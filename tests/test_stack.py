@@ -86,6 +86,54 @@ def test_equal_maxima_share_the_gradient(monkeypatch: pytest.MonkeyPatch) -> Non
     torch.testing.assert_close(found[1][0::2], found[1][1::2])
 
 
+@pytest.mark.parametrize("depth", [1, 3])
+@pytest.mark.parametrize("training", [False, True])
+def test_differences_of_tables_equal_layers(monkeypatch: pytest.MonkeyPatch, training: bool, depth: int) -> None:
+    """Rows that are made where they are needed, of points and centres, against rows that are stored."""
+    network = mlp(*(7, 16, 12, 20)[: depth + 1]).train(training)
+    idx = neighbors(3, 40, 50, 8)
+    table = torch.randn(150, 16, dtype=torch.float64, requires_grad=True)
+    centers = torch.randn(120, 16, dtype=torch.float64, requires_grad=True)
+
+    def both(groups: Groups) -> list[Tensor]:
+        copied = copy.deepcopy(network)
+        with torch.set_grad_enabled(training):
+            output = copied(table, projected=True, groups=groups, centers=centers)
+        if not training:
+            return [output]
+        weight = torch.linspace(-1, 1, output.numel(), dtype=torch.float64).view_as(output)
+        parameters = [
+            p for name, p in copied.named_parameters() if "linear.bias" not in name and name != "0.linear.weight"
+        ]
+        gradients = torch.autograd.grad((output * weight).sum(), [table, centers, *parameters])
+        return [output.detach(), *gradients, *copied.buffers()]
+
+    found = both(distinct(idx, 50))
+    monkeypatch.setattr(layers, "streamed", lambda *_: False)
+    for a, b in zip(found, both(single(idx, 50)), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("gamma", [0.0, 1e-9, 1e-3, -1e-3, 0.2])
+def test_flat_batch_norm(monkeypatch: pytest.MonkeyPatch, gamma: float) -> None:
+    """Scales near zero, whose ReLU bends far from the mean of the products."""
+    network, x = mlp(5, 8, 6, 7), torch.randn(100, 5, dtype=torch.float64)
+    for layer in network.layers:
+        nn.init.constant_(layer.norm.weight[::2], gamma)
+    found = run(network, x, None, False)
+    monkeypatch.setattr(layers, "streamed", lambda *_: False)
+    for a, b in zip(found, run(network, x, None, False), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-6)
+
+
+def test_rows_far_from_zero_keep_their_digits() -> None:
+    network, x = mlp(5, 8, 8, 8, 6), torch.randn(300, 5)
+    expected = network(x.double())
+    network.float()
+    torch.testing.assert_close(network(x).double(), expected, rtol=0, atol=2e-5)
+    torch.testing.assert_close(network(x + 1000).double(), expected, rtol=0, atol=0.02)
+
+
 @pytest.mark.parametrize("projected", [False, True])
 @pytest.mark.parametrize("grouped", [False, True])
 def test_inference_equals_layers(grouped: bool, projected: bool) -> None:

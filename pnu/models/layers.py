@@ -49,18 +49,23 @@ class MLP(nn.Sequential):
     def __init__(self, widths: Sequence[int], *, bias: bool = True) -> None:
         super().__init__(*(Layer(*pair, bias=bias) for pair in itertools.pairwise(widths)))
 
-    def forward(self, x: Tensor, *, projected: bool = False, groups: Groups | None = None) -> Tensor:
+    def forward(
+        self, x: Tensor, *, projected: bool = False, groups: Groups | None = None, centers: Tensor | None = None
+    ) -> Tensor:
         """Rows (..., C) through all layers.
 
         Args:
             projected: x already holds the products of the first layer's weight, without bias.
             groups: x is (R, C) and the output the maximum over groups of rows, (G, C').
+            centers: (G, C), with groups: x is a table (n, C), and row r is x[source[r]] - centers[owner[r]].
         """
         rows = x.reshape(-1, x.shape[-1])
         if streamed(x, self.training):
             run = stack.train if self.training else stack.infer
-            rows = run(rows, self.layers, projected=projected, groups=groups)
+            rows = run(rows, self.layers, projected=projected, groups=groups, centers=centers)
         else:
+            if groups is not None and centers is not None:
+                rows = combine(rows, groups.source[:, None]) - centers[groups.owner]
             for i, layer in enumerate(self.layers):
                 rows = layer(rows, projected=projected and i == 0)
             rows = rows if groups is None else pool(rows, groups)
@@ -108,7 +113,8 @@ def hierarchy(points: Tensor, radii: Sequence[float], k: int) -> list[Level]:
 class Abstraction(nn.Module):
     """Set abstraction of PointNet++: shared MLP over [offset, feature] of the neighbours, then their maximum.
 
-    The first layer is linear in both, so features are multiplied once a point, before they are gathered.
+    The first layer is linear in both, and an offset is point minus centre: both are multiplied once a point and once a
+    centre, before they are gathered.
     """
 
     def __init__(self, widths: Sequence[int]) -> None:
@@ -120,14 +126,10 @@ class Abstraction(nn.Module):
         clouds, m, _ = level.neighbors.shape
         n = points.shape[1]
         groups = (distinct if streamed(points, self.training) else single)(level.neighbors, n)
-        offsets = points.reshape(-1, 3)[groups.source] - level.points.reshape(-1, 3)[groups.owner]
-        flat = features.reshape(clouds * n, -1)
-        if not features.requires_grad and flat.shape[1] <= 3:
-            rows = torch.cat([offsets, flat[groups.source]], -1)
-            return self.mlp(rows, groups=groups).view(clouds, m, -1)
-        of_offsets, of_features = self.mlp.first_weight(3)
-        rows = torch.addmm(combine(F.linear(flat, of_features), groups.source[:, None]), offsets, of_offsets.t())
-        return self.mlp(rows, projected=True, groups=groups).view(clouds, m, -1)
+        of_offsets, _ = self.mlp.first_weight(3)
+        table = F.linear(torch.cat([points, features], -1).flatten(0, 1), self.mlp.layers[0].linear.weight)
+        centers = F.linear(level.points.reshape(-1, 3), of_offsets)
+        return self.mlp(table, projected=True, groups=groups, centers=centers).view(clouds, m, -1)
 
 
 class Propagation(nn.Module):

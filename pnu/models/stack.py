@@ -1,13 +1,17 @@
 """Layers over very many rows, made for the CPU: all that is not a matrix product happens in the cache.
 
 A stack of layers (linear, batch norm, ReLU) on rows (R, C) as torch runs it moves every activation about ten times
-through memory. Here each layer runs chunk by chunk: normalise and rectify the chunk below, multiply, collect
-statistics, store the products, nothing else. Backward computes the activations of a chunk anew. Three identities save
-more:
+through memory. Here each layer runs chunk by chunk: rectify the chunk below, multiply, sum up statistics, store the
+products, nothing else. Backward computes the activations of a chunk anew. Identities save more, most of them because
+batch norm cancels whatever constant is added to its input:
 
-- batch norm cancels the bias of its linear layer, which enters the running mean only (its gradient is zero);
+- the bias of its linear layer enters the running mean only (its gradient is zero);
+- ReLU(scale p + shift) is scale max(p, threshold) and a constant: one operation; the next weight takes in the scale;
+- the gradient of the products sums to zero over rows, so that constant does not enter the gradient of a weight either;
+- the sum of gradient times activation, which batch norm needs, follows from the weight and its gradient;
 - the maximum over a group commutes with the monotone batch norm and ReLU after it, so the products are pooled;
-- rows that count several times (`Groups.multiplicity`) are computed once and weighted in the statistics.
+- rows that count several times (`Groups.multiplicity`) are computed once and weighted in the statistics;
+- differences of two tables are made where they are used and never stored.
 
 Results are those of the plain layers to rounding, and the same bit for bit in every run with as many threads.
 """
@@ -25,20 +29,40 @@ from torch.autograd.function import once_differentiable
 from pnu.models.chunks import Chunk, Scratch, group_chunks, row_chunks, spread
 from pnu.models.neighborhoods import Groups, ungroup
 from pnu.models.norm import BatchNorm, everywhere
+from pnu.ops.combine import scatter
 
 if TYPE_CHECKING:
     from pnu.models.layers import Layer
 
+FAR = 8  # deviations between threshold and mean, beyond which their difference costs too many digits
 
-def train(x: Tensor, layers: Sequence[Layer], *, projected: bool = False, groups: Groups | None = None) -> Tensor:
+
+def train(
+    x: Tensor,
+    layers: Sequence[Layer],
+    *,
+    projected: bool = False,
+    groups: Groups | None = None,
+    centers: Tensor | None = None,
+) -> Tensor:
     """Layers in training mode on CPU rows x (R, C): (R, C'), or their maximum over groups, (G, C').
 
-    With `projected`, x already holds the products of the first layer.
+    With `projected`, x already holds the products of the first layer. With `centers` (neighbourhoods, C) too, x is a
+    table (points, C), and row r the difference x[groups.source[r]] - centers[groups.owner[r]].
     """
+    falling = layers[0].norm.weight.detach() < 0
+    if projected and bool(falling.any()):
+        sign = _sign(layers[0].norm)
+        x, centers = x * sign, None if centers is None else centers * sign
     weights = [None if projected and i == 0 else layer.linear.weight for i, layer in enumerate(layers)]
     biases = [layer.linear.bias for layer in layers]
     scales, shifts = [layer.norm.weight for layer in layers], [layer.norm.bias for layer in layers]
-    return _Stack.apply(x, layers, groups, *weights, *biases, *scales, *shifts)
+    return _Stack.apply(x, centers, layers, groups, *weights, *biases, *scales, *shifts)
+
+
+def _sign(norm: BatchNorm) -> Tensor:
+    """-1 where batch norm falls, else 1 (C,): products are multiplied with it, so that all batch norms rise."""
+    return torch.where(norm.weight.detach() < 0, -1.0, 1.0).to(norm.weight.dtype)
 
 
 class Norm(NamedTuple):
@@ -46,8 +70,9 @@ class Norm(NamedTuple):
 
     mean: Tensor
     inverse_deviation: Tensor
-    scale: Tensor
+    scale: Tensor  # > 0
     shift: Tensor
+    threshold: Tensor  # ReLU(scale p + shift) = scale (max(p, threshold) - threshold)
     total: float  # rows, in all processes
 
     def activate(self, products: Tensor, out: Tensor) -> Tensor:
@@ -55,46 +80,108 @@ class Norm(NamedTuple):
         return torch.addcmul(self.shift, products, self.scale, out=out).relu_()
 
 
-class Source(NamedTuple):
-    """Where the input of a layer comes from: rows as they are, or the products of the layer below."""
+class Moments(NamedTuple):
+    """Of the products of a layer, in float64."""
 
-    rows: Tensor
+    rows: Tensor  # their number, each as often as it counts
+    alone: Tensor  # sum of products - constant, (C,)
+    squares: Tensor  # sum of their squares
+    constant: Tensor
+    taken_off: bool  # the products are stored without the constant
+
+    @property
+    def mean(self) -> Tensor:
+        """Of the products as they are stored."""
+        mean = self.alone / self.rows
+        return mean if self.taken_off else self.constant + mean
+
+    @property
+    def square(self) -> Tensor:
+        """Sum of squared deviations from the mean."""
+        return self.squares - self.alone.square() / self.rows
+
+
+class Rows(NamedTuple):
+    """Rows as they are stored."""
+
+    table: Tensor
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.table.shape[0], self.table.shape[1]
+
+    def chunk(self, chunk: Chunk, space: Tensor) -> Tensor:
+        return self.table[chunk.rows]
+
+
+class Differences(NamedTuple):
+    """Rows table[groups.source] - centers[groups.owner], made when they are asked for."""
+
+    table: Tensor  # (points, C)
+    centers: Tensor  # (G, C), in the order of groups
+    groups: Groups
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return len(self.groups.source), self.table.shape[1]
+
+    def chunk(self, chunk: Chunk, space: Tensor) -> Tensor:
+        """Rows of a chunk, in `space`."""
+        out = space[: chunk.stop - chunk.start]
+        torch.index_select(self.table, 0, self.groups.source[chunk.rows], out=out)
+        chunk.grouped(out).sub_(self.centers[chunk.groups, None])
+        return out
+
+
+def _rows(x: Tensor, groups: Groups | None, centers: Tensor | None) -> Rows | Differences:
+    if centers is None or groups is None:
+        return Rows(x)
+    return Differences(x, centers if groups.order is None else centers[groups.order], groups)
+
+
+class Source(NamedTuple):
+    """Where the input of a layer comes from: rows as they are, or the products of the layer below, rectified."""
+
+    rows: Rows | Differences
     norm: Norm | None = None
 
     def chunk(self, chunk: Chunk, space: Tensor) -> Tensor:
-        """The input of a chunk; `space` holds it if it must be computed."""
-        rows = self.rows[chunk.rows]
-        return rows if self.norm is None else self.norm.activate(rows, space[: len(rows)])
+        """The input of a chunk, but for scale and shift; `space` holds it if it must be computed."""
+        rows = self.rows.chunk(chunk, space)
+        return rows if self.norm is None else torch.maximum(rows, self.norm.threshold, out=space[: len(rows)])
 
 
 class _Stack(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, x: Tensor, layers: Sequence[Layer], groups: Groups | None, *parameters: Tensor) -> Tensor:
-        weights: list[Tensor | None] = list(parameters[: len(layers)])
+    def forward(
+        ctx: Any, x: Tensor, centers: Tensor | None, layers: Sequence[Layer], groups: Groups | None, *parameters: Tensor
+    ) -> Tensor:
         often = groups.multiplicity if groups else None
         often = often if often is None else often.to(x.dtype)
-        source, sources, norms = Source(x), [], []
+        first = _rows(x, groups, centers)
+        source, stored, norms, weights = Source(first), [], [], []
+        pooled = None
         for i, layer in enumerate(layers):
-            sign = None
-            if groups and i == len(layers) - 1:
-                # a falling batch norm would ask for the minimum: let all rise
-                sign = torch.where(layer.norm.weight < 0, -1.0, 1.0).to(x.dtype)
-                weights[i] = parameters[i] * sign[:, None]
-            products, pooled, moments = _multiply(
-                source, weights[i], layer, often, groups if sign is not None else None
-            )
-            norms.append(_statistics(layer, sign, *moments))
-            sources.append(source)
+            weight = parameters[i]
+            if weight is not None:
+                weight = weight * _sign(layer.norm)[:, None]
+                weight = weight if source.norm is None else weight * source.norm.scale
+            last = i == len(layers) - 1
+            products, pooled, moments = _multiply(source, weight, layer, often, groups, last)
+            norms.append(_statistics(layer, weight, source.norm, moments))
+            stored.append(None if weight is None else products.table)
+            weights.append(weight)
             source = Source(products, norms[-1])
-        ctx.layers, ctx.groups, ctx.norms, ctx.sign = layers, groups, norms, sign
-        ctx.save_for_backward(often, pooled, *(source.rows for source in sources), source.rows, *weights)
+        ctx.layers, ctx.groups, ctx.norms, ctx.points = layers, groups, norms, len(x)
+        sorted_centers = first.centers if isinstance(first, Differences) else None
+        ctx.save_for_backward(often, pooled, x, sorted_centers, *stored, *weights)
         if pooled is not None and groups is not None:
             return ungroup(norms[-1].activate(pooled, torch.empty_like(pooled)), groups)
-        out = torch.empty_like(source.rows)
+        out = x.new_empty(source.rows.shape)
 
         def activate(part: list[Chunk]) -> None:
             for chunk in part:
-                source.chunk(chunk, out[chunk.rows])
+                norms[-1].activate(source.rows.chunk(chunk, out), out[chunk.rows])
 
         spread(activate, row_chunks(*out.shape))
         return out
@@ -103,103 +190,110 @@ class _Stack(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         layers, groups, norms, depth = ctx.layers, ctx.groups, ctx.norms, len(ctx.layers)
-        often, pooled, *tensors = ctx.saved_tensors
-        rows, weights = tensors[: depth + 1], tensors[depth + 1 :]
+        often, pooled, x, centers, *tensors = ctx.saved_tensors
+        first = Rows(x) if centers is None else Differences(x, centers, groups)
+        products = [first if table is None else Rows(table) for table in tensors[:depth]]
+        sources = [Source(first), *map(Source, products, norms)]  # sources[i] is the input of layer i
+        weights = tensors[depth:]
         d_weights: list[Tensor | None] = [None] * depth
         d_scales, d_shifts = [], []
-        maxima = None
+        norm = norms[-1]
         kept: Tensor | None
         if pooled is None:
-            kept, sums = _rectify_all(Source(rows[depth], norms[-1]), gradient.contiguous())
+            kept, sums = _rectify_all(products[-1], norm, gradient.contiguous())
         else:
             gradient = gradient if groups.order is None else gradient[groups.order]
-            kept = gradient * (norms[-1].activate(pooled, torch.empty_like(pooled)) > 0)
-            sums = torch.stack([kept.sum(0), (kept * (pooled - norms[-1].mean)).sum(0)])
-            maxima = (pooled, groups)
+            kept = (gradient * (pooled > norm.threshold)).mul_(norm.scale)
+            sums = torch.stack([kept.sum(0), (kept * (pooled - norm.mean)).sum(0)])
         for i in reversed(range(depth)):
-            norm = norms[i]
-            sign = ctx.sign if i == depth - 1 else None
+            norm, source = norms[i], sources[i]
             assert kept is not None  # wanted in every layer but the first
-            d_shifts.append(sums[0])
-            d_scales.append(sums[1] * norm.inverse_deviation * (1 if sign is None else sign))
-            products = _Gradient(
-                rows[i + 1], kept, norm, *_through_statistics(layers[i].norm, norm, sums), often, maxima
-            )
-            source = Source(rows[i], norms[i - 1] if i else None)
-            kept, sums, d_weight = _pull_back(products, source, weights[i], ctx.needs_input_grad[0])
-            d_weights[i] = d_weight if d_weight is None or sign is None else d_weight * sign[:, None]
-            maxima = None
+            sign = _sign(layers[i].norm)
+            d_shifts.append(sums[0] / norm.scale)
+            d_scales.append(sums[1] * norm.inverse_deviation / norm.scale * sign)
+            slope_level = _through_statistics(layers[i].norm, norm, sums)
+            d_products = _Gradient(products[i], kept, *slope_level, often, groups, pooled)
+            kept, sums, d_weight = _pull_back(d_products, source, weights[i], ctx.needs_input_grad[0])
+            if d_weight is not None:
+                scale = sign[:, None] if source.norm is None else sign[:, None] * source.norm.scale
+                d_weights[i] = d_weight * scale
+            pooled = None
         d_biases = [None if layer.linear.bias is None else torch.zeros_like(layer.linear.bias) for layer in layers]
-        return (kept, None, None, *d_weights, *d_biases, *reversed(d_scales), *reversed(d_shifts))
+        d_centers = None
+        if isinstance(first, Differences) and kept is not None:
+            d_centers = ungroup(_sums_of_groups(kept, groups).neg_(), groups)
+            kept = scatter(kept, groups.source[:, None], None, ctx.points)
+        return (kept, d_centers, None, None, *d_weights, *d_biases, *reversed(d_scales), *reversed(d_shifts))
+
+
+def _chunks(rows: int, width: int, groups: Groups | None) -> list[Chunk]:
+    return row_chunks(rows, width) if groups is None else group_chunks(groups, width)
 
 
 def _multiply(
-    source: Source, weight: Tensor | None, layer: Layer, often: Tensor | None, groups: Groups | None
-) -> tuple[Tensor, Tensor | None, tuple[Tensor, Tensor]]:
-    """Products (R, C) of a layer, their maxima (G, C) over groups if given, and counts and moments of their chunks."""
-    x, width = source.rows, layer.norm.num_features
-    products = x if weight is None else x.new_empty(len(x), width)
-    pooled = None if groups is None else x.new_empty(groups.number, width)
-    chunks = row_chunks(len(x), max(x.shape[1], width)) if groups is None else group_chunks(groups, width)
-    counts = _counts(chunks, often)
-    numbers = counts.flatten().tolist()
-    moments = x.new_empty(len(chunks), 2, width)
+    source: Source, weight: Tensor | None, layer: Layer, often: Tensor | None, groups: Groups | None, last: bool
+) -> tuple[Rows | Differences, Tensor | None, Moments]:
+    """Products (R, C) of a layer, after the last one their maxima (G, C) over groups if given, and their moments.
+
+    A constant (C,), near the mean, is taken off the products: no digits are lost to it, in no layer that follows.
+    """
+    rows, columns = source.rows.shape
+    like, width = layer.norm.weight.detach(), layer.norm.num_features
+    products = source.rows if weight is None else Rows(like.new_empty(rows, width))
+    pooled = like.new_empty(groups.number, width) if groups and last else None
+    chunks = _chunks(rows, max(columns, width), groups)
+    across = None if weight is None else weight.t().contiguous()
+    sums = like.new_empty(len(chunks), 2, width)
+
+    def multiply(chunk: Chunk, hidden: Tensor) -> Tensor:
+        out = products.chunk(chunk, hidden)
+        return out if across is None else torch.mm(source.chunk(chunk, hidden), across, out=out)
+
+    with torch.no_grad():
+        constant = multiply(chunks[0], Scratch(chunks[:1], like)(columns)).mean(0)
+        total = _everywhere(layer.norm, constant, torch.ones_like(constant))
+        constant = total[0] / total[1]  # the same in all processes
 
     def work(part: list[Chunk]) -> None:
-        scratch = Scratch(part, x)
-        hidden, space = scratch(x.shape[1]), scratch(width)
+        scratch = Scratch(part, like)
+        hidden, space = scratch(columns), scratch(width)
         for chunk in part:
-            out = products[chunk.rows]
-            if weight is not None:
-                torch.mm(source.chunk(chunk, hidden), weight.t(), out=out)
+            out = multiply(chunk, hidden)
+            free = space[: len(out)]
+            shifted = torch.sub(out, constant, out=free if across is None else out)
             if pooled is not None:
                 torch.amax(chunk.grouped(out), 1, out=pooled[chunk.groups])
-            ones = scratch.ones[: len(out)] if often is None else often[chunk.rows]
-            mean, square = moments[chunk.number]
-            torch.mv(out.t(), ones, out=mean).div_(numbers[chunk.number])
-            deviation = torch.sub(out, mean, out=space[: len(out)])
-            mean += torch.mv(deviation.t(), ones).div_(numbers[chunk.number])  # what the first sum lost to rounding
-            torch.mv(deviation.square_().t(), ones, out=square)
+            counts = scratch.ones[: len(out)] if often is None else often[chunk.rows]
+            alone, squares = sums[chunk.number]
+            torch.mv(shifted.t(), counts, out=alone)
+            torch.mv(torch.square(shifted, out=free).t(), counts, out=squares)
 
     spread(work, chunks)
-    return products, pooled, (counts, moments)
+    count = torch.tensor(float(rows), dtype=torch.float64) if often is None else often.double().sum()
+    alone, squares = sums.double().sum(0)
+    return products, pooled, Moments(count, alone, squares, constant.double(), across is not None)
 
 
-def _counts(chunks: list[Chunk], often: Tensor | None) -> Tensor:
-    """Rows of each chunk, each as often as it counts: (chunks, 1) float64."""
-    if often is None:
-        return torch.tensor([[chunk.stop - chunk.start] for chunk in chunks], dtype=torch.float64)
-    total = torch.cat([often.new_zeros(1), often]).double().cumsum(0)
-    stops = torch.tensor([chunk.stop for chunk in chunks])
-    starts = torch.tensor([chunk.start for chunk in chunks])
-    return (total[stops] - total[starts])[:, None]
-
-
-def _statistics(layer: Layer, sign: Tensor | None, counts: Tensor, moments: Tensor) -> Norm:
-    """Batch norm from the counts (chunks, 1), means and summed squared deviations (chunks, 2, C); updates the running
-    statistics. `sign` (C,) is what the products were multiplied with, so that all scales are positive."""
-    norm = layer.norm
-    means, squares = moments.double().unbind(1)
-    count = counts.sum()
-    mean = (counts * means).sum(0) / count
-    square = (squares + counts * (means - mean).square()).sum(0)
+def _statistics(layer: Layer, weight: Tensor | None, below: Norm | None, moments: Moments) -> Norm:
+    """Batch norm from the moments of all products; updates the running statistics. `weight` is the one that the
+    products were made with, from activations as `Source` gives them."""
+    norm, sign = layer.norm, _sign(layer.norm)
+    count, mean, square = moments.rows, moments.mean, moments.square
     if norm.synchronized:
         count, total, square = _everywhere(norm, count.expand_as(mean), count * mean, square + count * mean.square())
         mean = total / count
         square = square - count * mean.square()
     inverse = (square / count + norm.eps).rsqrt()
-    _track(layer, mean if sign is None else mean * sign, square / (count - 1))
-    gamma = norm.weight.detach().double()
-    scale = inverse * (gamma if sign is None else gamma.abs())
-    shift = norm.bias.detach().double() - mean * scale
+    plain = mean + moments.constant if moments.taken_off else mean
+    if weight is not None and below is not None:
+        plain = plain - weight.double() @ below.threshold.double()
+    plain = sign * plain
+    norm.track(plain if layer.linear.bias is None else plain + layer.linear.bias.detach(), square / (count - 1))
     dtype = norm.weight.dtype
-    return Norm(mean.to(dtype), inverse.to(dtype), scale.to(dtype), shift.to(dtype), count.max().item())
-
-
-def _track(layer: Layer, mean: Tensor, variance: Tensor) -> None:
-    """Update the running statistics with the bias that the products lack."""
-    bias = layer.linear.bias
-    layer.norm.track(mean if bias is None else mean + bias, variance)
+    scale = inverse * norm.weight.detach().double().abs().clamp_min(torch.finfo(dtype).eps)
+    shift = norm.bias.detach().double() - mean * scale
+    mean, inverse, scale, shift, threshold = (x.to(dtype) for x in (mean, inverse, scale, shift, -shift / scale))
+    return Norm(mean, inverse, scale, shift, threshold, count.max().item())
 
 
 def _everywhere(norm: BatchNorm, *sums: Tensor) -> list[Tensor]:
@@ -211,94 +305,92 @@ def _everywhere(norm: BatchNorm, *sums: Tensor) -> list[Tensor]:
 class _Gradient(NamedTuple):
     """Gradient of the products of a layer: directly, and through the mean and variance that they enter."""
 
-    products: Tensor
-    kept: Tensor  # gradient before the ReLU, (R, C) or of the maxima (G, C)
-    norm: Norm
+    products: Rows | Differences
+    kept: Tensor  # gradient before the ReLU times the scale, (R, C) or of the maxima (G, C)
     slope: Tensor
     level: Tensor
     often: Tensor | None
-    maxima: tuple[Tensor, Groups] | None
-
-    @property
-    def chunks(self) -> list[Chunk]:
-        rows, width = self.products.shape
-        return row_chunks(rows, width) if self.maxima is None else group_chunks(self.maxima[1], width)
+    groups: Groups | None
+    pooled: Tensor | None  # maxima
 
     def chunk(self, chunk: Chunk, out: Tensor, space: Tensor) -> Tensor:
-        """scale kept + often (slope products + level), (r, C)."""
-        products = self.products[chunk.rows]
+        """kept + often (slope products + level), (r, C)."""
+        products = self.products.chunk(chunk, space)
         torch.addcmul(self.level, products, self.slope, out=out)
-        if self.often is not None:
-            out *= self.often[chunk.rows, None]
-        if self.maxima is None:
-            return out.addcmul_(self.kept[chunk.rows], self.norm.scale)
+        if self.often is not None:  # only the first of a group counts several times
+            chunk.grouped(out)[:, 0] *= chunk.grouped(self.often[chunk.rows, None])[:, 0]
+        if self.pooled is None:
+            return out.add_(self.kept[chunk.rows])
         # to the maximum, in equal parts where there are several
-        pooled = self.maxima[0][chunk.groups]
+        pooled, gradient = self.pooled[chunk.groups], self.kept[chunk.groups]
         hit = torch.eq(chunk.grouped(products), pooled[:, None], out=chunk.grouped(space[: len(products)]))
-        gradient = self.kept[chunk.groups] * self.norm.scale
         if hit.sum() > pooled.numel():
-            gradient /= hit.sum(1)
+            gradient = gradient / hit.sum(1)
         chunk.grouped(out).addcmul_(hit, gradient[:, None])
         return out
 
 
 def _through_statistics(module: BatchNorm, norm: Norm, sums: Tensor) -> tuple[Tensor, Tensor]:
-    """Slope and level of the gradient that reaches all products alike, from the sums (2, C) of `_rectify`."""
+    """Slope and level of the gradient that reaches all products alike, from the sums (2, C) of `kept`: alone, and times
+    the deviation of the products from their mean."""
     alone, with_deviation = _everywhere(module, *sums)
-    slope = -norm.scale * norm.inverse_deviation.square() * with_deviation / norm.total
-    return slope, -norm.scale * alone / norm.total - slope * norm.mean
+    slope = -norm.inverse_deviation.square() * with_deviation / norm.total
+    return slope, -alone / norm.total - slope * norm.mean
 
 
 def _pull_back(
     gradient: _Gradient, source: Source, weight: Tensor | None, wanted: bool
 ) -> tuple[Tensor | None, Tensor, Tensor | None]:
-    """From the gradient of a layer's products to that of its input, before the ReLU below if there is a layer below.
+    """From the gradient of a layer's products to that of its input; if there is a layer below, before its ReLU and
+    times its scale.
 
-    Returns it (None if it is not wanted), its sums as of `_rectify`, and the gradient of the weight.
+    Returns it (None if it is not wanted), its sums as `_through_statistics` takes them, and the gradient of the weight
+    with respect to the activations as `Source` gives them.
     """
-    x, below = source.rows, source.norm
+    (rows, columns), below = source.rows.shape, source.norm
+    width, like = gradient.products.shape[1], gradient.kept
     wanted = wanted or below is not None
-    result = torch.empty_like(x) if wanted else None
-    chunks = gradient.chunks
-    sums = x.new_zeros(len(chunks), 2, x.shape[1])
+    result = like.new_empty(rows, columns) if wanted else None
+    chunks = _chunks(rows, max(columns, width), gradient.groups)
+    sums = like.new_zeros(len(chunks), 2, columns)
+    # where the threshold is far from the mean, the sum times the deviation is taken as it is
+    far = below is not None and bool(((below.threshold - below.mean).abs() * below.inverse_deviation > FAR).any())
 
     def work(part: list[Chunk]) -> Tensor | None:
-        scratch = Scratch(part, x)
-        width = gradient.products.shape[1]
+        scratch = Scratch(part, like)
         total = None if weight is None else torch.zeros_like(weight)
-        hidden, space, products = scratch(x.shape[1]), scratch(max(width, x.shape[1])).flatten(), scratch(width)
+        hidden, space, products = scratch(columns), scratch(max(width, columns)).flatten(), scratch(width)
         for chunk in part:
-            rows = chunk.stop - chunk.start
-            d_products = products[:rows] if weight is not None or result is None else result[chunk.rows]
-            gradient.chunk(chunk, d_products, space[: rows * width].view(rows, width))
+            number = chunk.stop - chunk.start
+            d_products = products[:number] if weight is not None or result is None else result[chunk.rows]
+            gradient.chunk(chunk, d_products, space[: number * width].view(number, width))
             if weight is None or total is None:
                 continue
             inputs = source.chunk(chunk, hidden)
             total.addmm_(d_products.t(), inputs)
-            if result is not None:
-                out = torch.mm(d_products, weight, out=result[chunk.rows])
-                if below is not None:
-                    free = space[: rows * x.shape[1]].view(rows, -1)
-                    _rectify(below, x[chunk.rows], inputs, out, free, scratch.ones[:rows], sums[chunk.number])
+            if result is None:
+                continue
+            out = torch.mm(d_products, weight, out=result[chunk.rows])
+            if below is not None:
+                free = space[: number * columns].view(number, columns)
+                out *= torch.gt(inputs, below.threshold, out=free)
+                alone, with_deviation = sums[chunk.number]
+                torch.mv(out.t(), scratch.ones[:number], out=alone)
+                if far:
+                    torch.sub(inputs, below.mean, out=free).mul_(out)
+                    torch.mv(free.t(), scratch.ones[:number], out=with_deviation)
         return total
 
     parts = spread(work, chunks)
-    return result, sums.sum(0), None if weight is None else torch.stack(parts).sum(0)  # type: ignore[arg-type]
+    d_weight = None if weight is None else torch.stack(parts).sum(0)  # type: ignore[arg-type]
+    total = sums.sum(0)
+    if below is not None and weight is not None and d_weight is not None and not far:
+        total[1] = (weight * d_weight).sum(0) + (below.threshold - below.mean) * total[0]
+    return result, total, d_weight
 
 
-def _rectify(
-    norm: Norm, products: Tensor, hidden: Tensor, gradient: Tensor, space: Tensor, ones: Tensor, sums: Tensor
-) -> None:
-    """Turn the gradient after a ReLU into that before it, in place, and sum it over rows (2, C): alone, and times the
-    deviation of the products from their mean."""
-    torch.ops.aten.threshold_backward.grad_input(gradient, hidden, 0, grad_input=gradient)
-    torch.mv(gradient.t(), ones, out=sums[0])
-    torch.sub(products, norm.mean, out=space)
-    torch.mv(space.mul_(gradient).t(), ones, out=sums[1])
-
-
-def _rectify_all(source: Source, gradient: Tensor) -> tuple[Tensor, Tensor]:
-    """`_rectify` of all rows, into a new tensor; and the sums (2, C)."""
+def _rectify_all(rows: Rows | Differences, norm: Norm, gradient: Tensor) -> tuple[Tensor, Tensor]:
+    """The gradient (R, C) of a stack's output, before the last ReLU and times the last scale; and its sums (2, C)."""
     kept = torch.empty_like(gradient)
     chunks = row_chunks(*gradient.shape)
     sums = gradient.new_empty(len(chunks), 2, gradient.shape[1])
@@ -307,27 +399,51 @@ def _rectify_all(source: Source, gradient: Tensor) -> tuple[Tensor, Tensor]:
         scratch = Scratch(part, gradient)
         hidden, space = scratch(gradient.shape[1]), scratch(gradient.shape[1])
         for chunk in part:
-            out = kept[chunk.rows].copy_(gradient[chunk.rows])
-            inputs = source.chunk(chunk, hidden)
-            products, rows = source.rows[chunk.rows], len(out)
-            _rectify(source.norm, products, inputs, out, space[:rows], scratch.ones[:rows], sums[chunk.number])  # type: ignore[arg-type]
+            products = rows.chunk(chunk, hidden)
+            number = len(products)
+            free, out = space[:number], kept[chunk.rows]
+            torch.mul(gradient[chunk.rows], torch.gt(products, norm.threshold, out=free), out=out).mul_(norm.scale)
+            alone, with_deviation = sums[chunk.number]
+            torch.mv(out.t(), scratch.ones[:number], out=alone)
+            torch.mv(torch.sub(products, norm.mean, out=free).mul_(out).t(), scratch.ones[:number], out=with_deviation)
 
     spread(work, chunks)
     return kept, sums.sum(0)
 
 
-def infer(x: Tensor, layers: Sequence[Layer], *, projected: bool = False, groups: Groups | None = None) -> Tensor:
+def _sums_of_groups(rows: Tensor, groups: Groups) -> Tensor:
+    """Sums of the rows (R, C) of each group: (G, C)."""
+    result = rows.new_empty(groups.number, rows.shape[1])
+
+    def work(part: list[Chunk]) -> None:
+        for chunk in part:
+            torch.sum(chunk.grouped(rows[chunk.rows]), 1, out=result[chunk.groups])
+
+    spread(work, group_chunks(groups, rows.shape[1]))
+    return result
+
+
+def infer(
+    x: Tensor,
+    layers: Sequence[Layer],
+    *,
+    projected: bool = False,
+    groups: Groups | None = None,
+    centers: Tensor | None = None,
+) -> Tensor:
     """`train` in eval mode and without gradient: batch norm folded into the weights, nothing stored between layers."""
     folded = [_fold(layer) for layer in layers]
-    width = max(x.shape[1], *(len(shift) for _, _, shift in folded))
-    chunks = row_chunks(len(x), width) if groups is None else group_chunks(groups, width)
-    result = x.new_empty(len(x) if groups is None else groups.number, len(folded[-1][2]))
+    rows = _rows(x, groups, centers)
+    width = max(rows.shape[1], *(len(shift) for _, _, shift in folded))
+    chunks = _chunks(rows.shape[0], width, groups)
+    result = x.new_empty(rows.shape[0] if groups is None else groups.number, len(folded[-1][2]))
 
     def work(part: list[Chunk]) -> None:
         scratch = Scratch(part, x)
         spaces = scratch(width).flatten(), scratch(width).flatten()
         for chunk in part:
-            h = x[chunk.rows]
+            number = chunk.stop - chunk.start
+            h = rows.chunk(chunk, spaces[1][: number * rows.shape[1]].view(number, -1))
             for i, (weight, scale, shift) in enumerate(folded):
                 out = spaces[i % 2][: len(h) * len(shift)].view(len(h), -1)
                 if projected and i == 0:

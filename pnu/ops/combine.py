@@ -36,20 +36,23 @@ class _Combine(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         idx, *weights = ctx.saved_tensors
-        queries, k = idx.shape
-        values = weights[0].flatten().numpy() if weights else np.ones(queries * k, np.float32)
-        matrix = csr_matrix(
-            (values, idx.flatten().numpy(), np.arange(0, queries * k + 1, k)),
-            shape=(queries, ctx.sources),
-        ).tocsc()
-        return (
-            F.embedding_bag(
-                torch.from_numpy(matrix.indices),
-                gradient.contiguous(),
-                torch.from_numpy(matrix.indptr[:-1]),
-                mode="sum",
-                per_sample_weights=torch.from_numpy(matrix.data),
-            ),
-            None,
-            None,
-        )
+        return scatter(gradient, idx, weights[0] if weights else None, ctx.sources), None, None
+
+
+def scatter(gradient: Tensor, idx: Tensor, weight: Tensor | None, sources: int) -> Tensor:
+    """The gradient (n, C) of `combine` with respect to its n = `sources` features, from that of its output (q, C).
+
+    CPU, float32 or float64.
+    """
+    queries, k = idx.shape
+    values = torch.ones(queries * k, dtype=gradient.dtype) if weight is None else weight.flatten()
+    matrix = csr_matrix(
+        (values.numpy(), idx.flatten().numpy(), np.arange(0, queries * k + 1, k)), shape=(queries, sources)
+    ).tocsc()
+    return F.embedding_bag(
+        torch.from_numpy(matrix.indices),
+        gradient.contiguous(),
+        torch.from_numpy(matrix.indptr[:-1]),
+        mode="sum",
+        per_sample_weights=torch.from_numpy(matrix.data),
+    )
