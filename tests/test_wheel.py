@@ -1,6 +1,7 @@
 """The wheel: installed alone in another folder, every command works from any directory."""
 
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -10,6 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from pnu.data import shapes
+from pnu.doctor import open3d_error
+from pnu.io import read_cloud, write_cloud, write_mesh
+from pnu.ops.surface import sample_area
+from tests.test_docs import SHORT, released_checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
@@ -92,3 +99,40 @@ def test_an_installed_script_upsamples_with_the_shipped_weights(site: Path, tmp_
     dense = np.loadtxt(tmp_path / "dense.xyz")
     assert dense.shape == (400, 6)
     assert np.abs(np.linalg.norm(dense[:, :3], axis=1) - 1).max() < 0.1
+
+
+@pytest.mark.slow
+def test_every_script_does_its_work_in_another_directory(site: Path, tmp_path: Path) -> None:
+    """From a scan and meshes to patches, networks, clouds, tables and pictures."""
+    mug = shapes.make("mug")
+    scan = sample_area(mug, 400, np.random.default_rng(0))
+    write_cloud(tmp_path / "scan.ply", scan[:, :3], scan[:, 3:])
+    (tmp_path / "meshes").mkdir()
+    for name in ("mug", "nut", "bolt"):
+        write_mesh(tmp_path / "meshes" / f"{name}.ply", shapes.make(name))
+    released_checkpoint(tmp_path / "epoch_1.pt")
+    measured = "shapes=[mug] kinds=[uniform] points=300 truth_points=1200 data=meshes data.root=meshes"
+    trained = f"data=patches data.path=patches.h5 {' '.join(SHORT['pnu.train'][1:])}"
+    lines = [
+        "pnu-prepare data=meshes data.root=meshes data.patches=12 output=patches.h5",
+        f"pnu-train run=run {trained}",
+        f"pnu-train -m loss.w3=0,0.05 sweep=s {trained}",
+        "pnu-report sweep=outputs/sweeps/s",
+        f"pnu-evaluate run=run {measured}",
+        f"pnu-compare methods=[run,midpoint] surfaces=[] size=64 output=page {measured}",
+        "pnu-export run=run output=mine.safetensors",
+        "pnu-convert input=epoch_1.pt output=converted",
+        "pnu-upsample input=scan.ply output=dense.ply run=mine.safetensors",
+        "pnu-picture inputs=[scan.ply,dense.ply] output=figure.png size=64",
+    ]
+    made = "patches.h5 run/metrics.json outputs/sweeps/s/report/report.md run/evaluation page/index.html converted"
+    if not open3d_error():
+        lines.append("pnu-reconstruct input=scan.ply output=mesh.ply")
+        made += " mesh.ply"
+    for line in lines:
+        script, *arguments = shlex.split(line)
+        run(site, tmp_path, site / "bin" / script, *arguments)
+    assert {line.split()[0] for line in lines} | {"pnu-reconstruct"} == set(SCRIPTS)
+    assert len(read_cloud(tmp_path / "dense.ply").points) == 1600
+    for path in [*made.split(), "figure.png"]:
+        assert (tmp_path / path).exists(), path
