@@ -23,7 +23,7 @@ class _Sums(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, prediction: Tensor, neighbors: Tensor, absolute: bool, tiny: float) -> Tensor:
         columns = prediction.mT.contiguous()  # (B, 6, m): long rows of one coordinate
-        # gradients of the three sums: by points; by points and by normals; by normals
+        # gradients: of half the first sum and of the second by points, of half the third and of the second by normals
         gradients = (
             torch.zeros(len(columns), 12, columns.shape[2], dtype=columns.dtype) if ctx.needs_input_grad[0] else None
         )
@@ -41,14 +41,15 @@ class _Sums(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:
         (gradients,) = ctx.saved_tensors
         point, orth, normal = gradient.tolist()
-        by_points = point * gradients[:, :3] + orth * gradients[:, 3:6]
-        by_normals = normal * gradients[:, 6:9] + orth * gradients[:, 9:]
+        by_points = 2 * point * gradients[:, :3] + orth * gradients[:, 3:6]
+        by_normals = 2 * normal * gradients[:, 6:9] + orth * gradients[:, 9:]
         return torch.cat([by_points, by_normals], 1).mT.contiguous(), None, None, None
 
 
 def _cloud(columns: Tensor, neighbors: Tensor, absolute: bool, tiny: float, gradient: Tensor | None) -> Tensor:
     """Sums (3,) float64 of one cloud (6, m); fills its gradient (12, m)."""
     total = torch.zeros(3, dtype=torch.float64)
+    others = torch.zeros_like(columns[:1].expand(9, -1))  # what reaches the neighbours
     for start in range(0, columns.shape[1], PIECE):
         idx = neighbors[start : start + PIECE]
         own = columns[:, start : start + PIECE, None]
@@ -66,9 +67,12 @@ def _cloud(columns: Tensor, neighbors: Tensor, absolute: bool, tiny: float, grad
             continue
         inverse *= sign
         turn = torch.where(squares[0] > tiny, signed / length_sq, 0)  # a clamped length does not change
-        pairs = torch.cat([2 * offsets[:3], normals * inverse - offsets[:3] * turn, 2 * offsets[3:]]).flatten(1)
-        gradient[:9].scatter_add_(1, idx.flatten().expand(9, -1), -pairs)
-        gradient[:9, start : start + PIECE] += pairs.view(9, *idx.shape).sum(-1)
+        turned = torch.addcmul(normals * inverse, offsets[:3], turn, value=-1)
+        for rows, pairs in ((slice(0, 3), offsets[:3]), (slice(3, 6), turned), (slice(6, 9), offsets[3:])):
+            others[rows].scatter_add_(1, idx.flatten().expand(3, -1), pairs.flatten(1))
+            gradient[rows, start : start + PIECE] = pairs.sum(-1)
         shrink = torch.where(normals.square().sum(0) > tiny, signed.sum(-1, keepdim=True) / normal_sq, 0)
         gradient[9:, start : start + PIECE] = (offsets[:3] * inverse).sum(-1) - (normals * shrink)[..., 0]
+    if gradient is not None:
+        gradient[:9] -= others
     return total
