@@ -192,3 +192,22 @@ def test_two_processes_train_as_one(tmp_path: Path, small: list[str]) -> None:
     assert one[-1] < 0.9 * one[0]
     np.testing.assert_allclose(two, one, rtol=1e-4)
     np.testing.assert_allclose(two[0], one[0], rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_nodes_of_slurm_train_as_one(tmp_path: Path, small: list[str]) -> None:
+    """Two nodes, as far as SLURM's variables tell: the losses of two processes of one machine."""
+    line = [*small, "trainer.max_epochs=2", "trainer.precision=64-true", "quiet=true", "trainer.sync_batchnorm=true"]
+    job = {"SLURM_JOB_ID": str(os.getpid()), "SLURM_JOB_NAME": "pnu", "SLURM_NTASKS": "2", "SLURM_NNODES": "2"}
+    job |= {"SLURM_NTASKS_PER_NODE": "1", "SLURM_NODELIST": "127.0.0.1", "SLURM_LOCALID": "0"}
+    nodes = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=1", "trainer.num_nodes=2"]
+    tasks = [
+        start(tmp_path, *line, *nodes, f"run={tmp_path / 'slurm'}", **job, SLURM_PROCID=rank, SLURM_NODEID=rank)
+        for rank in "01"
+    ]
+    for task in tasks:
+        error = task.communicate(timeout=300)[1]
+        assert task.returncode == 0, error
+    together = ["trainer.devices=2", "trainer.strategy=ddp", f"run={tmp_path / 'two'}"]
+    assert train(tmp_path, *line, *together).returncode == 0
+    np.testing.assert_allclose(curve(tmp_path / "slurm"), curve(tmp_path / "two"), rtol=1e-6)

@@ -20,7 +20,7 @@ from pnu.ops.blocks import Blocks, Index, split
 from pnu.ops.progress import Step, unheard
 
 BLOCK = 2**16  # points
-SURPLUS = 1.003  # points to choose, of those wanted: the last ones are dropped for an exact count
+SURPLUS = 1.006  # points to choose, of those wanted: the last ones are dropped for an exact count
 CLOSE = 1.01  # a greater surplus is worth another try,
 TRIES = 3  # of so many
 MARGIN = 4  # distances around a block within which it sees its neighbours
@@ -83,7 +83,7 @@ def farthest_in_blocks(
         for decline in pool.map(first, blocks.members):
             declines.append(decline)
             tick()
-        reach = _common_distance(declines, wanted)
+        reach, power, before = _common_distance(declines, wanted), 2.0, (0.0, 0)
         for attempt in count():
             total = (2 + attempt) * len(blocks.members)
             chosen, distance = _choose_all(xyz, blocks, declines, reach, choose, pool, tick)
@@ -93,7 +93,11 @@ def farthest_in_blocks(
             if attempt > TRIES or reach < 1e-9 * np.ptp(xyz, axis=0).max():
                 reach = 0.0  # takes all
             else:
-                reach *= math.sqrt(surplus / wanted * m)
+                # on a surface the number falls with the square of the distance, in a thick layer faster
+                if before[1] not in (0, len(chosen)):
+                    power = min(max(math.log(before[1] / len(chosen)) / math.log(reach / before[0]), 1.0), 6.0)
+                before = reach, len(chosen)
+                reach *= (len(chosen) / wanted) ** (1 / power)
     raise AssertionError
 
 
