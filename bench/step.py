@@ -8,9 +8,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import lru_cache, partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 from unittest.mock import patch
 
+import h5py
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -23,6 +26,7 @@ import pnu.models.layers
 from bench.plain import PlainLoss, PlainPNU
 from bench.timing import Row, compare
 from pnu.data import shapes
+from pnu.data.datamodule import PatchDataModule
 from pnu.lit import steady_memory
 from pnu.losses import CompoundLoss
 from pnu.models.pnu import PNU
@@ -91,10 +95,28 @@ def loss_of(loss: nn.Module, prediction: Tensor) -> None:
 
 
 def step_rows(rounds: int = 3) -> list[Row]:
-    """The step against the plain port."""
+    """The step against the plain port, and the data of a step against the step."""
     ours, plain = trainings()
-    with steady_memory():
-        return [compare(f"training step, {SIZE}", {"pnu": ours, "plain torch port": plain}, rounds=rounds)]
+    with steady_memory(), TemporaryDirectory() as folder:
+        return [
+            compare(f"training step, {SIZE}", {"pnu": ours, "plain torch port": plain}, rounds=rounds),
+            compare(
+                "data of a step: loaded, downsampled, augmented", {"pnu": loading(Path(folder)), "training step": ours}
+            ),
+        ]
+
+
+def loading(folder: Path) -> Callable[[], object]:
+    """Loads one training batch, as a training does without workers."""
+    _, target = data()
+    path = folder / "patches.h5"
+    with h5py.File(path, "w") as file:
+        file["poisson_4096"] = target.repeat(2, 1, 1).numpy()
+        file["name"] = [f"shape {i // 4}" for i in range(2 * CLOUDS)]
+    module = PatchDataModule(str(path), batch_size=CLOUDS, augmentation={})
+    module.setup()
+    loader = module.train_dataloader()
+    return lambda: next(iter(loader))
 
 
 def loss_rows(rounds: int = 3) -> list[Row]:
