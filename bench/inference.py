@@ -13,13 +13,13 @@ from bench.ops import full_matrix, plain_farthest_points
 from bench.plain import PlainPNU
 from bench.scale import wavy_sphere
 from bench.timing import Row, compare
-from pnu import weights
 from pnu.inference import upsample
-from pnu.io import write_cloud
+from pnu.io import write_cloud, write_json
 from pnu.models.pnu import PNU
 from pnu.models.released import from_released
 
 POINTS, RATIO, PATCH = 5000, 4, 1024
+SHARED = 20_000  # points of a cloud that processes share
 
 
 @torch.no_grad()
@@ -49,6 +49,16 @@ def plain_loop(points: Tensor, m: int) -> Tensor:
     return chosen
 
 
+def as_run(network: torch.nn.Module, folder: Path) -> Path:
+    """A run folder with a network of the paper."""
+    (folder / "checkpoints").mkdir(parents=True)
+    state = {f"model.{name}": value for name, value in network.state_dict().items()}
+    torch.save({"state_dict": state}, folder / "checkpoints" / "best.ckpt")
+    (folder / "config.yaml").write_text("model: {_target_: pnu.models.pnu.PNU}\n")
+    write_json(folder / "run.json", {"status": "finished"})
+    return folder
+
+
 def rows() -> list[Row]:
     torch.manual_seed(0)
     plain, ours = PlainPNU().eval(), PNU().eval()
@@ -75,6 +85,15 @@ def rows() -> list[Row]:
             rounds=3,
         ),
     ]
+    large = wavy_sphere(SHARED)
+    share = partial(upsample, large[:, :3], large[:, 3:], model="surface", device="cpu")
+    warm.append(
+        compare(
+            f"upsample {SHARED} -> {RATIO * SHARED}, surface, {torch.get_num_threads()} threads",
+            {"pnu": share, "2 processes, with their start (devices=2)": partial(share, devices=2)},
+            rounds=1,
+        )
+    )
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "cloud.ply", Path(folder) / "dense.ply"
         write_cloud(source, points, normals)
@@ -85,12 +104,11 @@ def rows() -> list[Row]:
             compare(
                 f"whole command {size}, {name}",
                 {
-                    "python -m pnu.upsample": partial(run, [*command, f"run={name}"]),
+                    "python -m pnu.upsample": partial(run, [*command, f"run={weights}"]),
                     "import torch": partial(run, alone),
                 },
                 rounds=3,
             )
-            for name in ("surface", "surface_estimated")
-            if name in weights.names()
+            for name, weights in (("network pnu", as_run(ours, Path(folder) / "run")), ("surface", "surface"))
         ]
     return warm + cold
