@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -182,3 +183,33 @@ def test_long_runs_keep_parts_until_the_output_is_there(place: Path, monkeypatch
     module.main([*GOOD, "quiet=true", "run=surface"])
     assert len(read_cloud(place / "dense.ply").points) == 800
     assert not parts.exists()
+
+
+@pytest.mark.slow
+def test_killed_and_gone_on(tmp_path: Path) -> None:
+    """`kill -9` in the middle, and the same command again: the file of a run that was never killed."""
+    points = np.random.default_rng(0).normal(size=(8000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    write_cloud(tmp_path / "cloud.ply", points, points)
+    code = (
+        "import pnu.upsample as module; from pnu.models import surface\n"
+        "if __name__ == '__main__': module.LONG, surface.KEPT = 1, 2**12; module.main()"
+    )
+    (tmp_path / "run.py").write_text(code)
+
+    def start(output: str) -> subprocess.Popen[str]:
+        line = [sys.executable, "run.py", "input=cloud.ply", f"output={output}", "run=surface"]
+        return subprocess.Popen(line, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+
+    with start("whole.ply") as whole:
+        assert "earlier" not in whole.communicate()[0]
+    for at_least in (3, 12):
+        with start("dense.ply") as process:
+            while len(list(tmp_path.glob("dense.ply.parts/*/*.npy"))) < at_least:
+                assert process.poll() is None
+                time.sleep(0.01)
+            process.kill()
+    with start("dense.ply") as process:
+        assert "parts:  dense.ply.parts, of an earlier start; what fits is taken" in process.communicate()[0]
+    assert (tmp_path / "dense.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
+    assert not (tmp_path / "dense.ply.parts").exists()
