@@ -73,7 +73,7 @@ class Model:
     candidates: float = doc("of them, after thinning out to even spacing")
     relaxation: int = doc("steps of even spacing; 0: none")
     refinements: int = doc("projections after the even spacing")
-    reject: float = doc("share of points made too many; those with the highest expected error are dropped")
+    reject: float = doc("share of points made too many; of doubtful neighbours the worst are dropped")
     sphere: bool = doc("start from the sphere that fits the neighbours, not from the seed")
     attention: bool = doc("weigh the neighbours; without it all count alike")
 
