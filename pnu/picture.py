@@ -67,7 +67,7 @@ def picture(cfg: Any) -> None:
     image = pictures.figure(panels, names, columns=cfg.columns, colorbar=bar)
     pictures.save_png(cfg.output, image)
     if not cfg.quiet:
-        kinds = (f"{'mesh' if s.mesh is not None else 'cloud'} by {s.source(cfg.color)}" for s in shapes)
+        kinds = (f"{'mesh' if s.mesh is not None else 'cloud'}, color={s.source(cfg.color)}" for s in shapes)
         print(f"panels: {', '.join(f'{path} ({kind})' for path, kind in zip(inputs, kinds, strict=True))}")
         height, width = image.shape[:2]
         print(f"output: {cfg.output}, {width} x {height} pixels, {time.perf_counter() - started:.1f} s")

@@ -23,7 +23,7 @@ class Upsample:
     """Densify a point cloud file with a trained network; `model=NAME` is `run=NAME`."""
 
     also: ClassVar = {"model": "run"}
-    input: str = doc("file to read: ply, xyz, txt, pcd, obj, off or npy")
+    input: str = doc("file to read: ply, xyz, txt, pcd, obj, off, npy, las or laz")
     output: str = doc("file to write; its suffix says the format")
     run: str | None = doc(
         "run folder, or weights that come with pnu: surface, pnu ...; null: the newest run, or surface"

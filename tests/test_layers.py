@@ -3,6 +3,8 @@
 import ast
 import subprocess
 import sys
+from collections.abc import Collection
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -87,6 +89,24 @@ def test_upward_import_is_found(tmp_path: Path) -> None:
     culprit.write_text("def f():\n    from pnu.ops import nearest\n")
     names = modules() | {"pnu.io": culprit}
     assert "pnu.io imports pnu.ops" in violations(names)
+
+
+def files_imported(path: Path, names: Collection[str]) -> set[str]:
+    """The files behind the imports of a file, those for type checkers too."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            inside = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= inside & set(names) or {node.module}
+    return found & set(names)
+
+
+def test_no_file_imports_itself_on_a_round_way() -> None:
+    names = modules()
+    graph = {module: files_imported(path, names) - {module} for module, path in names.items()}
+    TopologicalSorter(graph).prepare()
+    with pytest.raises(CycleError):
+        TopologicalSorter(graph | {"pnu.io.atomic": {"pnu.checkpoint"}}).prepare()
 
 
 @pytest.mark.parametrize("package", ["lightning", "open3d"])

@@ -146,6 +146,19 @@ def test_cloud_shows_normals_as_colours_and_hides_the_far_side() -> None:
     assert (open_picture < 255).any(2).sum() > (seen < 255).any(2).sum()
 
 
+def test_a_small_object_at_map_coordinates_looks_the_same() -> None:
+    """Ten centimetres, in metres, thousands of kilometres from the origin."""
+    near = sphere(300) * [0.05, 0.05, 0.05, 1, 1, 1]
+    far = near + [4_123_456.789, 5_312_345.678, 123.4, 0, 0, 0]
+    pictures = [render_cloud(cloud, camera=look_at(cloud), size=60).astype(int) for cloud in (near, far)]
+    assert np.abs(pictures[0] - pictures[1]).mean() < 0.5
+    mesh = octahedron()
+    for cloud, scale in ((near, 0.05), (far, 0.05)):
+        place = mesh._replace(vertices=mesh.vertices * scale + cloud[:, :3].mean(0))
+        pictures.append(render_mesh(place, camera=look_at(place.vertices), size=60).astype(int))
+    assert np.abs(pictures[2] - pictures[3]).mean() < 0.5
+
+
 def test_spacing_knows_density_not_randomness() -> None:
     rng = np.random.default_rng(2)
     random = rng.normal(size=(4000, 3))

@@ -5,19 +5,24 @@ candidates are kept may differ after a rotation or another rounding; where the s
 """
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import pnu
-from pnu import evaluation
+from pnu import evaluation, picture, reconstruct
 from pnu.data import shapes
+from pnu.doctor import open3d_error
+from pnu.io import read_cloud, read_mesh, write_cloud
 from pnu.ops.surface import closest_points, sample_area
+from pnu.upsample import main as upsample_main
 
 Array = np.ndarray
 MESH = shapes.make("mug")
@@ -115,6 +120,26 @@ def test_millimetres_at_map_coordinates(dense: Array, normals: Array | None) -> 
     moved = upsample(POINTS + place, normals)
     same_surface(dense, moved - np.r_[place, 0, 0, 0])
     assert len(np.unique(np.round(moved[:, 0] % 1, 6))) > len(moved) / 2, "less than float64 somewhere on the way"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", ["ply", "xyz", "las", "laz", "pcd", "npy"])
+def test_millimetres_at_map_coordinates_through_the_commands(tmp_path: Path, suffix: str) -> None:
+    """A mug of ten centimetres: what is written and drawn is that of the mug at the origin."""
+    place, scale = np.array([4_123_456.789, 5_312_345.678, 123.4]), 0.05
+    write_cloud(tmp_path / f"scan.{suffix}", POINTS * scale + place, NORMALS)
+    files = [tmp_path / name for name in (f"scan.{suffix}", f"dense.{suffix}", "mesh.ply")]
+    scan, dense, mesh = files
+    upsample_main([f"input={scan}", f"output={dense}", "run=surface", "quiet=true"])
+    found = read_cloud(dense)
+    assert error((found.points - place) / scale) < 1.05 * error(upsample(POINTS, NORMALS, ratio=4)) + 1e-4
+    if not open3d_error():
+        reconstruct.main([f"input={dense}", f"output={mesh}", "quiet=true"])
+        assert error((read_mesh(mesh).vertices - place) / scale) < 0.02
+    drawn = [str(path) for path in files if path.exists()]
+    picture.main([f"inputs=[{','.join(drawn)}]", f"output={tmp_path / 'figure.png'}", "size=200", "quiet=true"])
+    with Image.open(tmp_path / "figure.png") as figure:
+        assert figure.height > 150, "the mug fills its panel"
 
 
 @pytest.mark.parametrize("options", [{"batch_size": 33}, {"batch_size": 200}])

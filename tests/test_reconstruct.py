@@ -123,9 +123,9 @@ def test_picture_of_files(folder: Path, tmp_path: Path, capsys: pytest.CaptureFi
     files = ",".join(str(folder / name) for name in ("cloud.ply", "mesh.ply", "truth.ply"))
     run(picture, inputs=f"[{files}]", output=tmp_path / "a.png", size=100)
     said = capsys.readouterr().out
-    assert "cloud.ply (cloud by stored)" in said
-    assert "mesh.ply (mesh by quality)" in said
-    assert "truth.ply (mesh by plain)" in said
+    assert "cloud.ply (cloud, color=stored)" in said
+    assert "mesh.ply (mesh, color=quality)" in said
+    assert "truth.ply (mesh, color=plain)" in said
     image = np.asarray(Image.open(tmp_path / "a.png")).astype(int)
     height, width = image.shape[:2]
     assert width > 2.5 * height

@@ -45,7 +45,7 @@ def killed(process: subprocess.Popen[bytes], moment: Callable[[], bool]) -> bool
         time.sleep(0.001)
     process.send_signal(signal.SIGKILL)
     ended = process.wait() == 0
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 60  # a process that has just been started loads its modules first
     while (left := session(process.pid)) and time.monotonic() < deadline:
         time.sleep(0.1)
     for pid in left:

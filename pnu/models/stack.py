@@ -19,7 +19,7 @@ Results are those of the plain layers to rounding, and the same bit for bit in e
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.distributed
@@ -27,12 +27,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pnu.models.chunks import Chunk, Scratch, group_chunks, row_chunks, spread
+from pnu.models.layer import Layer
 from pnu.models.neighborhoods import Groups, ungroup
 from pnu.models.norm import BatchNorm, everywhere
 from pnu.ops.combine import scatter
-
-if TYPE_CHECKING:
-    from pnu.models.layers import Layer
 
 FAR = 8  # deviations between threshold and mean, beyond which their difference costs too many digits
 

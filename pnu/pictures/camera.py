@@ -44,5 +44,5 @@ def look_at(
     rotation = raise_ @ turn @ to_y_up
     seen = everything @ rotation.T
     low, high = seen.min(0), seen.max(0)
-    half_size = max((high - low)[:2].max() / 2, 1e-6 * np.abs(seen).max(), 1e-300)
+    half_size = max((high - low)[:2].max() / 2, 1e-12 * np.abs(seen).max(), 1e-300)
     return Camera(rotation, rotation.T @ ((low + high) / 2), margin * half_size)

@@ -6,7 +6,7 @@ A command is a dataclass (its keys, their types, a line on each), `conf/<command
     class Upsample:
         '''Densify a point cloud file.'''
 
-        input: str = doc("file to read: ply, xyz, pcd, obj, off or npy")
+        input: str = doc("file to read: ply, xyz, pcd, obj, off, npy, las or laz")
         ratio: float = doc("points out for each point in")
 
     def upsample(cfg: Upsample) -> None:
