@@ -162,7 +162,7 @@ def test_interrupted_by_hand(tmp_path: Path, small: list[str]) -> None:
     while not (tmp_path / "run/checkpoints/last.ckpt").exists() and process.poll() is None:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=300)
     assert process.returncode == 130
     assert "Traceback" not in err
     assert (

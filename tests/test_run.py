@@ -194,6 +194,7 @@ class Upsample:
     patch_size: int | None = doc("")
     batch_size: int | None = doc("")
     device: str = doc("")
+    devices: int = doc("")
     seed: int = doc("")
     quiet: bool = doc("")
 
