@@ -134,13 +134,13 @@ def test_a_failed_job_leaves_the_others_and_a_record(tmp_path: Path, small: list
 
 
 def test_killed_and_resumed_as_if_never_stopped(tmp_path: Path, small: list[str]) -> None:
-    options = [*small, "callbacks.checkpoints.every_n_steps=1", "trainer.max_epochs=12", "quiet=true"]
+    options = [*small, "callbacks.checkpoints.every_n_steps=1", "trainer.max_epochs=6", "quiet=true"]
     options += ["model.local_features=false"]
     process = start(tmp_path, *options, f"run={tmp_path / 'killed'}")
     last = tmp_path / "killed/checkpoints/last.ckpt"
     while not last.exists() and process.poll() is None:
         time.sleep(0.05)
-    time.sleep(0.5)
+    time.sleep(0.2)
     process.send_signal(signal.SIGKILL)
     process.communicate()
     assert process.returncode == -signal.SIGKILL, "it ended before it could be killed"
@@ -149,7 +149,7 @@ def test_killed_and_resumed_as_if_never_stopped(tmp_path: Path, small: list[str]
     assert train(tmp_path, f"run={tmp_path / 'killed'}", "resume=true", "quiet=true").returncode == 0
     assert train(tmp_path, *options, f"run={tmp_path / 'whole'}").returncode == 0
     killed, whole = (read(tmp_path / name / "checkpoints/last.ckpt") for name in ("killed", "whole"))
-    assert 0 < stopped_at < killed["global_step"] == whole["global_step"] == 60
+    assert 0 < stopped_at < killed["global_step"] == whole["global_step"] == 30
     assert all(torch.equal(killed["state_dict"][name], value) for name, value in whole["state_dict"].items())
     assert json.loads((tmp_path / "killed/run.json").read_text())["status"] == "finished"
     assert not list((tmp_path / "killed").rglob(".*")), "a temporary file was left"

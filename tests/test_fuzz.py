@@ -18,7 +18,7 @@ def check(results: list[dict], readers: int, cases: int) -> None:
 @pytest.mark.usefixtures("untraced")
 def test_a_few_cases_of_every_reader(tmp_path: Path) -> None:
     readers = [name for name in READERS if name != "laz"]  # which takes a process a case
-    check(fuzz(readers, 18, 7, tmp_path), len(readers), 18)  # 270 in all
+    check(fuzz(readers, 12, 7, tmp_path), len(readers), 12)  # 180 in all
 
 
 @pytest.mark.slow
