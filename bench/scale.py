@@ -31,26 +31,27 @@ upsample(cloud[:2000, :3], cloud[:2000, 3:], model=model)
 begun = {}
 status = lambda name: int(re.search(name + r":\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) / 2**20
 Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
-before, started = status("VmRSS"), time.perf_counter()
+before, started, used = status("VmRSS"), time.perf_counter(), time.process_time()
 say = lambda stage, done, total: begun.setdefault(stage.split(",")[0], time.perf_counter() - started)
 dense = upsample(cloud[:, :3], normals, model=model, progress=say)
-seconds = time.perf_counter() - started
+seconds, used = time.perf_counter() - started, time.process_time() - used
 assert dense.shape == (4 * n, 6)
 clouds = (cloud.nbytes + dense.nbytes) / 2**30
 beyond = status("VmHWM") - before - dense.nbytes / 2**30
 ends = [*list(begun.values())[1:], seconds]
-print(json.dumps([seconds, beyond, clouds, {stage: end - begun[stage] for stage, end in zip(begun, ends)}]))
+print(json.dumps([seconds, used, beyond, clouds, {stage: end - begun[stage] for stage, end in zip(begun, ends)}]))
 if kept:
     write_cloud(kept, dense[:, :3], dense[:, 3:])
 """
 
 
 class Point(NamedTuple):
-    """One size: seconds, and peak memory beyond input and output, both in GiB."""
+    """One size: seconds, those of the processors, and peak memory beyond input and output, both in GiB."""
 
     points: int
     model: str
     seconds: float
+    processor_seconds: float
     beyond_gib: float
     clouds_gib: float
     stages: dict[str, float]  # seconds
@@ -99,10 +100,13 @@ def exponent(curve: list[Point]) -> float:
 
 
 def lines(curve: list[Point]) -> list[str]:
-    text = ["| points | x4, model | s | us a point made | memory beyond the clouds, GiB |", "|---|---|---|---|---|"]
+    text = [
+        "| points | x4, model | s | us a point made | processors, s | memory beyond the clouds, GiB |",
+        "|---|---|---|---|---|---|",
+    ]
     for point in curve:
-        each = 1e6 * point.seconds / (4 * point.points)
-        text.append(f"| {point.points} | {point.model} | {point.seconds:.1f} | {each:.0f} | {point.beyond_gib:.2f} |")
+        each = f"{point.seconds:.1f} | {1e6 * point.seconds / (4 * point.points):.0f} | {point.processor_seconds:.1f}"
+        text.append(f"| {point.points} | {point.model} | {each} | {point.beyond_gib:.2f} |")
     for model in dict.fromkeys(point.model for point in curve):
         slope = exponent([point for point in curve if point.model == model])
         text += ["", f"time of {model} grows with the number of points to the power {slope:.2f}"]
