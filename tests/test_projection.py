@@ -4,10 +4,12 @@ from typing import Any
 
 import pytest
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pnu.models.surface import Projector, Surface, spared
 from pnu.ops.frames import local_frames, tangent_basis
+from pnu.ops.spacing import spacing
 from pnu.ops.spread import repel, tangent_discs
 from pnu.ops.transforms import rotation_matrix
 
@@ -296,3 +298,17 @@ def test_every_stage_of_a_large_run_moves(monkeypatch: pytest.MonkeyPatch) -> No
         done, total = zip(*told, strict=True)
         assert len(set(done)) > 4, stage
         assert max(done) == done[-1] == total[-1]
+
+
+@pytest.mark.slow
+def test_no_holes_where_points_were_rejected() -> None:
+    """Points of the true surface and the nearest point made, in spacings of the points made."""
+    from bench.scale import wavy_sphere
+    from pnu.inference import upsample
+
+    cloud = wavy_sphere(10_000)
+    dense = cKDTree(upsample(cloud[:, :3], cloud[:, 3:], model="surface")[:, :3])
+    apart = spacing(dense.data)
+    truth = wavy_sphere(400_000)[:, :3]
+    assert dense.query(truth)[0].max() < 1.3 * apart
+    assert cKDTree(cloud[:, :3]).query(truth)[0].max() > 2 * apart  # of the input, which is random
