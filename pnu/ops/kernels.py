@@ -10,6 +10,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+if not hasattr(tl, "topk"):
+    raise ImportError("Triton 3.3 or later is needed: this one lacks topk")
+
 # A candidate is one int64: the bits of its squared distance (whose order is that of non-negative floats), then its
 # index. Its smallest values are the nearest points, the lower index first among equals.
 NO_CANDIDATE = tl.constexpr(0x7FFFFFFFFFFFFFFF)
