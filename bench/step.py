@@ -27,7 +27,6 @@ from bench.plain import PlainLoss, PlainPNU
 from bench.timing import Row, compare
 from pnu.data import shapes
 from pnu.data.datamodule import PatchDataModule
-from pnu.lit import steady_memory
 from pnu.losses import CompoundLoss
 from pnu.models.pnu import PNU
 from pnu.models.released import from_released
@@ -97,7 +96,7 @@ def loss_of(loss: nn.Module, prediction: Tensor) -> None:
 def step_rows(rounds: int = 3) -> list[Row]:
     """The step against the plain port, and the data of a step against the step."""
     ours, plain = trainings()
-    with steady_memory(), TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder:
         return [
             compare(f"training step, {SIZE}", {"pnu": ours, "plain torch port": plain}, rounds=rounds),
             compare(
@@ -155,7 +154,7 @@ def profile(rounds: int = 3) -> Profile:
     """Our step in turn with a large matrix product, both on one thread."""
     ours, _ = trainings()
     a, b = torch.randn(CLOUDS * POINTS, 512), torch.randn(512, 512)
-    with one_thread(), steady_memory():
+    with one_thread():
         with FlopCounterMode(display=False, custom_mapping=IN_PLACE) as counter:
             ours()
         row = compare("step", {"step": ours, "product": lambda: [a @ b for _ in range(10)]}, rounds=rounds)

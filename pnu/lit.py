@@ -1,15 +1,11 @@
 """Training as Lightning sees it: one step, one validation, the optimizer."""
 
-import ctypes
-import gc
 import inspect
 import logging
 import math
 import os
-import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +33,6 @@ TRAINER_OPTIONS = {
     "inference_mode": False,  # its tensors would stay in the metrics, of no use to the training after them
     "use_distributed_sampler": False,
 }
-M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # malloc.h
 NOISE = (  # warnings of Lightning and torch that ask for what is meant as it is
     ".*does not have many workers.*",
     ".*is smaller than the logging interval.*",
@@ -61,22 +56,6 @@ def keep_threads() -> None:
     which torch takes instead, and another number of threads rounds differently."""
     if os.environ.get("OMP_NUM_THREADS", "").isdigit():
         torch.set_num_threads(max(1, int(os.environ["OMP_NUM_THREADS"])))
-
-
-@contextmanager
-def steady_memory() -> Iterator[None]:
-    """For a training: what a step frees stays with the process for the next step (glibc; else the kernel clears
-    hundreds of megabytes anew in each), and the garbage collector leaves alone what was there before."""
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
-    if mallopt is not None:
-        mallopt(M_MMAP_MAX, 0)
-        mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
-    gc.collect()
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
 
 
 class SynchronizedNorms(TorchSyncBatchNorm):

@@ -69,8 +69,7 @@ def train(cfg: Any) -> list[float] | None:
         start = run.last if run.last.exists() else None
         if start is None:
             run.add_metrics("untrained", trainer.validate(module, data, verbose=False))
-        with lit.steady_memory():
-            trainer.fit(module, data, ckpt_path=start, weights_only=True)
+        trainer.fit(module, data, ckpt_path=start, weights_only=True)
         if run.best.exists():
             module.load_state_dict(checkpoint.read(run.best)["state_dict"])
         run.add_metrics("test", trainer.test(module, data, verbose=False))

@@ -1,10 +1,7 @@
 """The Lightning module, alone: what it logs, what stops it, what it optimizes."""
 
 import functools
-import gc
 import math
-import platform
-import resource
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
-from pnu.lit import TRAINER_OPTIONS, NonFinite, UpsamplingModule, quieten, steady_memory
+from pnu.lit import TRAINER_OPTIONS, NonFinite, UpsamplingModule, quieten
 from pnu.losses import CompoundLoss
 from pnu.metrics import chamfer_sq
 
@@ -211,18 +208,3 @@ def test_mixed_precision_trains(tmp_path: Path) -> None:
     record = Record()
     trainer(tmp_path, record, precision="bf16-mixed").fit(module(), loader(), loader(2))
     assert all(map(math.isfinite, record.values("train/loss")))
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's allocator")
-def test_freed_memory_stays_for_the_next_step() -> None:
-    def faults(times: int) -> int:
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-        for _ in range(times):
-            torch.empty(2**24).fill_(1)  # 64 MiB, 16384 pages
-        return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-
-    with steady_memory():
-        assert gc.get_freeze_count() > 0
-        faults(1)
-        assert faults(8) < 3 * 2**14  # not 8 times
-    assert gc.get_freeze_count() == 0
