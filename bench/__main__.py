@@ -8,7 +8,7 @@ import argparse
 import os
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib.metadata import version
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from bench import inference, ops, scale, step
 from bench.timing import Row
 from pnu.io import atomic_path, write_json
 
-PARTS: dict[str, Callable[[], list[Row]]] = {
+PARTS: dict[str, Callable[[], Iterable[Row]]] = {
     "ops": ops.rows,
     "loss": step.loss_rows,
     "step": step.step_rows,

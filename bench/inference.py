@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from pnu.models.pnu import PNU
 from pnu.models.released import from_released
 
 POINTS, RATIO, PATCH = 5000, 4, 1024
-SHARED = 20_000  # points of a cloud that processes share
+SHARED = 10_000  # points of a cloud that processes share
 
 
 @torch.no_grad()
@@ -59,7 +60,8 @@ def as_run(network: torch.nn.Module, folder: Path) -> Path:
     return folder
 
 
-def rows() -> list[Row]:
+def rows() -> Iterator[Row]:
+    """Each as soon as it is measured."""
     torch.manual_seed(0)
     plain, ours = PlainPNU().eval(), PNU().eval()
     ours.load_state_dict(from_released(plain.state_dict()))
@@ -67,32 +69,24 @@ def rows() -> list[Row]:
     points, normals = cloud[:, :3], cloud[:, 3:]
     tensor = torch.from_numpy(cloud).float()
     size = f"{POINTS} -> {RATIO * POINTS}"
-    warm = [
-        compare(
-            f"upsample {size}, network pnu, warm",
-            {
-                "pnu": partial(upsample, points, normals, model=ours),
-                "the paper's procedure, naively": partial(naive, plain, tensor),
-            },
-            rounds=3,
-        ),
-        compare(
-            f"upsample {size}, surface, warm",
-            {
-                "pnu": partial(upsample, points, normals, model="surface"),
-                "the paper's procedure, naively": partial(naive, plain, tensor),
-            },
-            rounds=3,
-        ),
-    ]
+    theirs = "the paper's procedure, naively"
+    turns = compare(
+        "",
+        {
+            "pnu": partial(upsample, points, normals, model=ours),
+            "surface": partial(upsample, points, normals, model="surface"),
+            theirs: partial(naive, plain, tensor),
+        },
+        rounds=2,
+    ).seconds
+    for name, title in (("pnu", "network pnu"), ("surface", "surface")):
+        yield Row(f"upsample {size}, {title}, warm", {"pnu": turns[name], theirs: turns[theirs]})
     large = wavy_sphere(SHARED)
     share = partial(upsample, large[:, :3], large[:, 3:], model="surface", device="cpu")
-    warm.append(
-        compare(
-            f"upsample {SHARED} -> {RATIO * SHARED}, surface, {torch.get_num_threads()} threads",
-            {"pnu": share, "2 processes, with their start (devices=2)": partial(share, devices=2)},
-            rounds=1,
-        )
+    yield compare(
+        f"upsample {SHARED} -> {RATIO * SHARED}, surface, {torch.get_num_threads()} threads",
+        {"pnu": share, "2 processes, with their start (devices=2)": partial(share, devices=2)},
+        rounds=1,
     )
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "cloud.ply", Path(folder) / "dense.ply"
@@ -100,8 +94,8 @@ def rows() -> list[Row]:
         command = [sys.executable, "-m", "pnu.upsample", f"input={source}", f"output={target}", "quiet=true"]
         alone = [sys.executable, "-c", "import torch"]
         run = partial(subprocess.run, check=True, capture_output=True)
-        cold = [
-            compare(
+        for name, weights in (("network pnu", as_run(ours, Path(folder) / "run")), ("surface", "surface")):
+            yield compare(
                 f"whole command {size}, {name}",
                 {
                     "python -m pnu.upsample": partial(run, [*command, f"run={weights}"]),
@@ -109,6 +103,3 @@ def rows() -> list[Row]:
                 },
                 rounds=3,
             )
-            for name, weights in (("network pnu", as_run(ours, Path(folder) / "run")), ("surface", "surface"))
-        ]
-    return warm + cold
