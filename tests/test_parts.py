@@ -22,10 +22,10 @@ def sphere(n: int) -> np.ndarray:
     return points / np.linalg.norm(points, axis=1, keepdims=True)
 
 
-def patches() -> PNU:
+def patches(size: int = 128) -> PNU:
     torch.manual_seed(0)
     network = PNU(local_features=False)
-    network.patch_size = 128
+    network.patch_size = size
     return network
 
 

@@ -17,23 +17,11 @@ from torch import Tensor
 from pnu import inference
 from pnu.inference import upsample
 from pnu.models import surface
-from pnu.models.pnu import PNU
 from pnu.ops.workers import Here, Processes
+from tests.test_parts import patches, sphere
 
 CLOUD = torch.arange(12.0, dtype=torch.float64).view(4, 3)
 REPOSITORY = Path(__file__).resolve().parents[1]
-
-
-def sphere(n: int) -> np.ndarray:
-    points = np.random.default_rng(0).normal(size=(n, 3))
-    return points / np.linalg.norm(points, axis=1, keepdims=True)
-
-
-def patches() -> PNU:
-    torch.manual_seed(0)
-    network = PNU(local_features=False)
-    network.patch_size = 64
-    return network
 
 
 def make(device: str) -> Callable[[Tensor], Callable[[Tensor], Tensor]]:
@@ -80,7 +68,7 @@ def test_order_errors_and_end() -> None:
 def test_the_number_of_devices_does_not_matter(model: str, devices: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(surface, "BATCHES", 1)  # many parts
     monkeypatch.setattr(inference, "BATCHES", 2)
-    points, network = sphere(1000), "surface" if model == "surface" else patches()
+    points, network = sphere(1000), "surface" if model == "surface" else patches(64)
     one, several = (
         upsample(points, points, ratio=2, model=network, device="cpu", devices=number) for number in (1, devices)
     )
