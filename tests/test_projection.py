@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pnu.models.surface import Projector, Surface, spared
-from pnu.ops.frames import local_frames, tangent_basis
+from pnu.ops.frames import feet, local_frames, tangent_basis
 from pnu.ops.spacing import spacing
 from pnu.ops.spread import repel, tangent_discs
 from pnu.ops.transforms import rotation_matrix
@@ -169,6 +169,25 @@ def test_batch_size_does_not_matter() -> None:
     torch.testing.assert_close(parts, whole, atol=1e-9, rtol=0)
 
 
+def test_projector_is_the_same_with_and_without_gradient() -> None:
+    torch.manual_seed(0)
+    projector = Projector().double()
+    torch.nn.init.normal_(projector.out.weight, std=0.3)
+    around = neighbourhoods(sphere(200), sphere(50), 24)
+    with torch.no_grad():
+        lean = projector(*around)
+    for a, b in zip(lean, projector(*around), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-12)
+
+
+def test_feet_are_those_of_the_frames() -> None:
+    around = neighbourhoods(sphere(200), sphere(50) * 1.1, 12)
+    step, normal = feet(*around)
+    frame = local_frames(*around)
+    torch.testing.assert_close(step, frame.base)
+    torch.testing.assert_close(normal, frame.axes[:, 2])
+
+
 def test_untrained_model_stays_on_a_sphere() -> None:
     dense = Surface().upsample_cloud(sphere(600), 2400)
     assert (dense[:, :3].norm(dim=1) - 1).abs().max() < 1e-3
@@ -293,7 +312,8 @@ def test_every_stage_of_a_large_run_moves(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(spread, "ROWS", 1000)
     steps: dict[str, list[tuple[int, int]]] = {}
     Surface().upsample_cloud(sphere(600), 2400, progress=lambda stage, *step: steps.setdefault(stage, []).append(step))
-    assert list(steps) == ["seeds", "projection", "thinning", "even spacing", "refinement 1", "refinement 2"]
+    stages = ["seeds", "spheres", "shortlist", "projection", "thinning", "even spacing", "refinement 1", "refinement 2"]
+    assert list(steps) == stages
     for stage, told in steps.items():
         done, total = zip(*told, strict=True)
         assert len(set(done)) > 4, stage

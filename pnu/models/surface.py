@@ -5,6 +5,7 @@ a first foot and normal; a small network shared by all neighbours, with maximum 
 There are no patches, hence no borders; the cost grows with the output; any ratio is possible.
 """
 
+from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -13,7 +14,7 @@ from torch.nn.functional import linear, normalize
 
 from pnu.ops import threads
 from pnu.ops.blocks import along_curve
-from pnu.ops.frames import FEATURES, local_frames
+from pnu.ops.frames import FEATURES, feet, local_frames
 from pnu.ops.grouping import gather
 from pnu.ops.nearest import Search, knn
 from pnu.ops.noise import noise_level
@@ -28,9 +29,11 @@ EACH = 3  # seeds of a point, in training, before they are thinned out
 PUSH = 0.1  # between rounds of training, beside the way from its point to a seed
 SMOOTH = 0.1  # noise in spacings from which on a cloud is smoothed first
 KEPT = 2**19  # queries whose projections are kept in one file
-BATCHES = 64  # on a CPU, that its threads share
+BATCH = 512  # queries at once on a CPU,
+BATCHES = 32  # of which its threads share so many
 AROUND = 8  # points of which one at most is dropped,
 DOUBTFUL = 16  # looked for among so many for each point to drop
+CLOSE = 12  # neighbours of the sphere that candidates are first moved to
 DENSE = 16  # neighbours that are all looked at; farther ones are thinned out
 
 
@@ -56,11 +59,11 @@ class Projector(nn.Module):
         with torch.no_grad():
             frame = local_frames(offsets, normals, hint, sphere=self.sphere)
         y = self.second(self.first(frame.features).relu_()).relu_()
-        context = self.context(torch.cat([y.amax(1), (self.shares(y) * y).sum(1), frame.height], -1))
+        context = self.context(torch.cat([y.amax(1), self.weighed(y.clone(), y), frame.height], -1))
         # the bias is added to the few contexts, not to the many neighbours
         y = linear(y, self.third.weight).add_((context + self.third.bias)[:, None]).relu_()
         of_features, of_choices = self.attention.weight.split([y.shape[-1], 2])
-        seen = (self.shares(linear(y, of_features)) * y).sum(1)
+        seen = self.weighed(linear(y, of_features), y)
         choice = self.shares(linear(y, of_choices))
         out = self.out(self.head(torch.cat([y.amax(1), seen, context], -1)))
         # beside what the network finds freely, it chooses among the neighbours' normals and their bent planes
@@ -69,6 +72,14 @@ class Projector(nn.Module):
         normal = (choice[..., :1] * frame.features[..., 3:6]).sum(1) + out[:, 3:6]
         step, normal = ((v[:, None] @ frame.axes)[:, 0] for v in (step, normal))
         return frame.base + frame.spacing * step, normalize(normal, dim=-1), out[:, 6], frame.spacing
+
+    def weighed(self, logits: Tensor, y: Tensor) -> Tensor:
+        """Sum of y (m, k, c) over the neighbours, by their `shares`: (m, c). Without gradient logits are overwritten."""
+        if torch.is_grad_enabled() or not self.attend:
+            return (self.shares(logits) * y).sum(1)
+        shares = logits.sub_(logits.amax(1, keepdim=True)).exp_()
+        total = shares.sum(1)
+        return shares.mul_(y).sum(1).div_(total)
 
     def shares(self, logits: Tensor) -> Tensor:
         """Weights of the neighbours, for each of the features (m, k, c); all alike without attention."""
@@ -85,7 +96,8 @@ class Surface(nn.Module):
         width: of the network.
         rounds: projections in training; at work there are 1 + `refinements`.
         seeds: seeds for each point wanted.
-        candidates: seeds for each point wanted after they were thinned out to an even spacing.
+        candidates: seeds for each point wanted after they were thinned out to an even spacing; each moves to a sphere.
+        shortlist: of those, for each point wanted, thinned out again for the network.
         relaxation: steps of even spacing.
         refinements: projections after it; one more is nearer to the surface and a little less even.
         reject: share of the points that is made too many; the worst of
@@ -100,9 +112,9 @@ class Surface(nn.Module):
 
     def __init__(
         self, ratio: int = 4, neighbours: int = 24, reach: int = 24, width: int = 64, rounds: int = 2,
-        seeds: float = 3, candidates: float = 1.5, relaxation: int = 4,
-        refinements: int = 2, reject: float = 0.003, queries: int = 64,
-        sphere: bool = True, attention: bool = True,
+        seeds: float = 3, candidates: float = 1.5, shortlist: float = 1.15,
+        relaxation: int = 4, refinements: int = 2, reject: float = 0.003,
+        queries: int = 64, sphere: bool = True, attention: bool = True,
     ) -> None:  # fmt: skip
         super().__init__()
         if not 4 <= neighbours <= reach:
@@ -112,8 +124,8 @@ class Surface(nn.Module):
         if refinements < 1:
             raise ValueError(f"model.refinements={refinements}: expected at least 1")
         self.ratio, self.neighbours, self.reach, self.rounds = ratio, neighbours, reach, rounds
-        self.seeds, self.candidates, self.relaxation, self.reject = seeds, candidates, relaxation, reject
-        self.refinements, self.queries = refinements, queries
+        self.seeds, self.candidates, self.shortlist = seeds, candidates, shortlist
+        self.relaxation, self.refinements, self.reject, self.queries = relaxation, refinements, reject, queries
         self.projector = Projector(width, sphere=sphere, attention=attention)
 
     def outputs(self, patch: Tensor) -> dict[str, Tensor]:
@@ -205,8 +217,12 @@ class Surface(nn.Module):
         query = keep(
             "seeds", lambda: seeds_around(cloud, each, round(self.candidates * count), partial(progress, "seeds"))
         ).to(cloud)
+        if self.projector.sphere:
+            here = Here(partial(self.spheres, batch_size=batch_size))
+            query, _ = run(query, cloud, workers=here, stage="spheres")
+        some, more = round(self.shortlist * count), round((1 + self.reject) * count)
+        query = keep("shortlist", lambda: thin(query, some, partial(progress, "shortlist"))).to(cloud)
         query, error = run(query, cloud, stage="projection")
-        more = round((1 + self.reject) * count)
         query = keep("thinned", lambda: thin(query, more, partial(progress, "thinning"))).to(cloud)
         if self.relaxation:
             query = keep("even", lambda: evened(query, self.relaxation, partial(progress, "even spacing"))).to(cloud)
@@ -249,31 +265,52 @@ class Surface(nn.Module):
         return everything[:, :6], everything[:, 6]
 
     def projections(self, cloud: Tensor, batch_size: int | None = None) -> Work:
-        """Around a cloud (n, 6): queries (m, 6) -> projected and logarithm of the expected error, (m, 7).
+        """Around a cloud (n, 6): queries (m, 6) -> projected and logarithm of the expected error, (m, 7)."""
+        ranks = self.ranks(len(cloud))
+
+        def project(query: Tensor, cloud: Tensor, idx: Tensor) -> Tensor:
+            projected, log_error, spacing = self.project(query[None], cloud[None], idx[None, :, ranks])
+            return torch.cat([projected[0], (log_error[0] + spacing[0].log()).to(projected)[:, None]], 1)
+
+        return self.by_neighbors(project, cloud, self.reach, batch_size)
+
+    def spheres(self, cloud: Tensor, batch_size: int | None = None) -> Work:
+        """As `projections`, but to the sphere that fits the nearest points, without network and expected error."""
+
+        def project(query: Tensor, cloud: Tensor, idx: Tensor) -> Tensor:
+            near, like = cloud[idx], self.projector.out.weight
+            offsets = near[..., :3] - query[:, None, :3]
+            step, normal = (x.to(query) for x in feet(*(x.to(like) for x in (offsets, near[..., 3:], query[:, 3:]))))
+            return torch.cat([query[:, :3] + step, normal, torch.zeros_like(step[:, :1])], 1)
+
+        return self.by_neighbors(project, cloud, CLOSE, batch_size)
+
+    def by_neighbors(
+        self, project: Callable[[Tensor, Tensor, Tensor], Tensor], cloud: Tensor, k: int, batch_size: int | None
+    ) -> Work:
+        """project(queries (m, 6), cloud (n, 6), their k nearest points as idx (m, k)), for queries in batches.
 
         On the CPU each thread works on batches of its own, so the result does not depend on their number.
         """
         cloud = cloud[along_curve(cloud[:, :3])].to(self.projector.out.weight.device)
-        search, size, reach = Search(cloud[:, :3]), self.batch(cloud, batch_size), min(self.reach, len(cloud))
+        search, size, on_cpu = Search(cloud[:, :3]), self.batch(cloud, batch_size), cloud.device.type == "cpu"
 
         def work(query: Tensor) -> Tensor:
-            query = query.to(cloud)[None]
-            idx = search.knn(query[0, :, :3], reach).idx[None, :, self.ranks(len(cloud))]
+            query = query.to(cloud)
+            idx = search.knn(query[:, :3], min(k, len(cloud))).idx
+            batches = [slice(start, start + size) for start in range(0, len(query), size)]
 
-            def project(part: slice) -> Tensor:
-                projected, log_error, spacing = self.project(query[:, part], cloud[None], idx[:, part])
-                return torch.cat([projected[0], (log_error[0] + spacing[0].log()).to(projected)[:, None]], 1)
+            def batch(part: slice) -> Tensor:
+                return project(query[part], cloud, idx[part])
 
-            batches = [slice(start, start + size) for start in range(0, query.shape[1], size)]
-            on_cpu = cloud.device.type == "cpu"
-            return torch.cat(threads.spread(project, batches) if on_cpu else [project(batch) for batch in batches])
+            return torch.cat(threads.spread(batch, batches) if on_cpu else [batch(part) for part in batches])
 
         return work
 
     @staticmethod
     def batch(cloud: Tensor, batch_size: int | None) -> int:
         """Queries at once."""
-        return batch_size or (256 if cloud.device.type == "cpu" else 2**16)
+        return batch_size or (BATCH if cloud.device.type == "cpu" else 2**16)
 
 
 def noise_in_spacings(cloud: Tensor) -> float:

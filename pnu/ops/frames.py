@@ -31,24 +31,41 @@ def local_frames(offsets: Tensor, normals: Tensor, hint: Tensor, *, sphere: bool
     neighbours spread most on a plane; the signs of both axes come from the third moment of the positions. So frames
     turn, move and grow with the cloud. Without `sphere` the foot is the query and its normal the rough one.
     """
-    dist = offsets.norm(dim=-1)
-    spacing = dist.mean(1, keepdim=True).clamp(min=torch.finfo(dist.dtype).tiny)
+    spacing, seen, weights = _surroundings(offsets, normals, hint)
     x = offsets / spacing[..., None]
-    facing = (1 + (normals * hint[:, None]).sum(-1)).clamp(min=2e-3) / 2
-    weights = neighbour_weights((dist / spacing).square()) * facing.square()
-    weights = weights / weights.sum(1, keepdim=True).clamp(min=torch.finfo(dist.dtype).tiny)
-    step, z = project_to_sphere(*fit_sphere(x, normals, weights)) if sphere else (torch.zeros_like(hint), hint)
-    step = step * (REACH / step.norm(dim=-1, keepdim=True).clamp(min=REACH))
-    z = torch.where(z.norm(dim=-1, keepdim=True) > 0.5, z, hint)
+    step, z = _foot(x, normals, hint, weights) if sphere else (torch.zeros_like(hint), hint)
     x = x - step[:, None]
     axes = torch.stack([*_tangents(x, normals, z, weights), z], 1)
     local, local_normals = x @ axes.mT, normals @ axes.mT
     height = (local * local_normals).sum(-1, keepdim=True)  # of the foot below the neighbour's plane
     bent = 0.5 * (height + local[..., 2:])  # the same if the surface bends evenly: exact on a sphere
-    seen = (normals * hint[:, None]).sum(-1, keepdim=True)
     share = weights[..., None] * weights.shape[1]
-    features = torch.cat([local, local_normals, local.norm(dim=-1, keepdim=True), bent, height, seen, share], -1)
+    length = local.norm(dim=-1, keepdim=True)
+    features = torch.cat([local, local_normals, length, bent, height, seen[..., None], share], -1)
     return LocalFrames(step * spacing, axes, spacing, -(step * z).sum(-1, keepdim=True), features)
+
+
+def feet(offsets: Tensor, normals: Tensor, hint: Tensor) -> tuple[Tensor, Tensor]:
+    """Step (m, 3) from each query to its foot, and the unit normal there (m, 3), alone; else as `local_frames`."""
+    spacing, _, weights = _surroundings(offsets, normals, hint)
+    step, normal = _foot(offsets / spacing[..., None], normals, hint, weights)
+    return step * spacing, normal
+
+
+def _surroundings(offsets: Tensor, normals: Tensor, hint: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean distance of the neighbours (m, 1), cosine of their normals and the rough one, their weights (m, k)."""
+    dist = offsets.norm(dim=-1)
+    spacing = dist.mean(1, keepdim=True).clamp(min=torch.finfo(dist.dtype).tiny)
+    seen = (normals @ hint[..., None])[..., 0]
+    weights = neighbour_weights((dist / spacing).square()) * ((1 + seen).clamp(min=2e-3) / 2).square()
+    return spacing, seen, weights / weights.sum(1, keepdim=True).clamp(min=torch.finfo(dist.dtype).tiny)
+
+
+def _foot(x: Tensor, normals: Tensor, hint: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Step in spacings onto the sphere that fits neighbours x (m, k, 3), and the normal there."""
+    step, z = project_to_sphere(*fit_sphere(x, normals, weights))
+    step = step * (REACH / step.norm(dim=-1, keepdim=True).clamp(min=REACH))
+    return step, torch.where(z.norm(dim=-1, keepdim=True) > 0.5, z, hint)
 
 
 def _tangents(x: Tensor, normals: Tensor, z: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

@@ -71,6 +71,7 @@ class Model:
     queries: int = doc("seeds of a crop, in training")
     seeds: float = doc("seeds for each point wanted")
     candidates: float = doc("of them, after thinning out to even spacing")
+    shortlist: float = doc("of those, thinned out again after they moved to spheres")
     relaxation: int = doc("steps of even spacing; 0: none")
     refinements: int = doc("projections after the even spacing")
     reject: float = doc("share of points made too many; of doubtful neighbours the worst are dropped")
