@@ -74,7 +74,7 @@ class Projector(nn.Module):
         return frame.base + frame.spacing * step, normalize(normal, dim=-1), out[:, 6], frame.spacing
 
     def weighed(self, logits: Tensor, y: Tensor) -> Tensor:
-        """Sum of y (m, k, c) over the neighbours, by their `shares`: (m, c). Without gradient logits are overwritten."""
+        """Sum of y (m, k, c) over the neighbours, by their `shares`: (m, c). Without gradient it overwrites logits."""
         if torch.is_grad_enabled() or not self.attend:
             return (self.shares(logits) * y).sum(1)
         shares = logits.sub_(logits.amax(1, keepdim=True)).exp_()
@@ -113,7 +113,7 @@ class Surface(nn.Module):
     def __init__(
         self, ratio: int = 4, neighbours: int = 24, reach: int = 24, width: int = 64, rounds: int = 2,
         seeds: float = 3, candidates: float = 1.5, shortlist: float = 1.15,
-        relaxation: int = 4, refinements: int = 2, reject: float = 0.003,
+        relaxation: int = 2, refinements: int = 2, reject: float = 0.003,
         queries: int = 64, sphere: bool = True, attention: bool = True,
     ) -> None:  # fmt: skip
         super().__init__()
