@@ -112,7 +112,7 @@ class Surface(nn.Module):
 
     def __init__(
         self, ratio: int = 4, neighbours: int = 24, reach: int = 24, width: int = 64, rounds: int = 2,
-        seeds: float = 3, candidates: float = 1.5, shortlist: float = 1.15,
+        seeds: float = 4, candidates: float = 2, shortlist: float = 1.15,
         relaxation: int = 2, refinements: int = 2, reject: float = 0.003,
         queries: int = 64, sphere: bool = True, attention: bool = True,
     ) -> None:  # fmt: skip
