@@ -2,8 +2,9 @@
 
 FOLDER holds pairs, clouds/NAME.xyz with normals and truth/NAME.ply with truth/NAME_<count>.npy; without it the test
 part of the procedural shapes is drawn. Each setting changes these inputs in one way; all methods get the same ones with
-the same estimated normals where a setting gives none. --surfaces measures Poisson surfaces, of the input and of its
-dense versions. Every setting is kept in OUTPUT/quality_<setting>.json, and OUTPUT/quality.md has the tables of all.
+the same estimated normals where a setting gives none. --surfaces measures Poisson surfaces of the input, of its dense
+versions and of the truth's own samples. Every setting is kept in OUTPUT/quality_<setting>.json, and OUTPUT/quality.md
+has the tables of all.
 """
 
 import argparse
@@ -100,11 +101,13 @@ def clouds(cases: list[Case], setting: Setting, methods: list[str], seed: int, f
 
 
 def poisson(cases: list[Case], setting: Setting, methods: list[str], seed: int, folder: Path) -> Iterator[Row]:
-    """Errors of the Poisson surfaces of each input and of its dense versions, in units of the true radius."""
+    """Errors of the Poisson surfaces of inputs, dense versions and samples of the truth, over the true radius."""
     for case in cases:
         assert case.normals is not None
         assert case.truth.mesh is not None
         found = {"input": np.hstack([case.points, case.normals])}
+        if case.truth.samples.shape[1] == 6:
+            found["samples of the truth"] = case.truth.samples  # what no upsampling beats at as many points
         for method in methods:
             if method != "poisson":
                 found[Path(method).name] = upsample(
