@@ -304,11 +304,11 @@ def test_training_seeds_are_spread_and_pushed_outward() -> None:
 
 def test_every_stage_of_a_large_run_moves(monkeypatch: pytest.MonkeyPatch) -> None:
     from pnu.models import surface
-    from pnu.ops import sampling, spread, thinning
+    from pnu.ops import sampling, spread
 
     monkeypatch.setattr(surface, "BATCHES", 1)
     monkeypatch.setattr(sampling, "LARGE", 2000)
-    monkeypatch.setattr(thinning, "BLOCK", 1000)
+    monkeypatch.setattr(sampling, "LARGE_BLOCK", 1000)
     monkeypatch.setattr(spread, "ROWS", 1000)
     steps: dict[str, list[tuple[int, int]]] = {}
     Surface().upsample_cloud(sphere(600), 2400, progress=lambda stage, *step: steps.setdefault(stage, []).append(step))

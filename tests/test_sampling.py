@@ -25,15 +25,17 @@ def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-@pytest.fixture(params=["vanilla", "buckets", "steps"])
+@pytest.fixture(params=["vanilla", "buckets", "without fpsample", "steps"])
 def path(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The two samplers of the CPU, whatever the size, and the loop of other devices."""
+    """The samplers of the CPU, whatever the size, and the loop of other devices."""
     if request.param == "steps":
 
         def steps(points: Tensor, m: int, *, start: int = 0, skip_near_origin: bool = False) -> Tensor:
             return module._farthest_steps(points.float(), m, torch.full((len(points),), start), skip_near_origin)
 
         monkeypatch.setattr("tests.test_sampling.farthest_points", steps)
+    elif request.param == "without fpsample":
+        monkeypatch.setattr(module, "fpsample", None)
     else:
         monkeypatch.setattr(module, "BUCKETS_PAY", 0 if request.param == "buckets" else 2**62)
 

@@ -1,6 +1,5 @@
 """Choose some points of a cloud: evenly, at random, or unevenly on purpose."""
 
-import fpsample
 import numpy as np
 import torch
 from torch import Tensor
@@ -9,10 +8,16 @@ from pnu.ops.nearest import gpu_kernels, nearest, per_cloud
 from pnu.ops.progress import Step, unheard
 from pnu.ops.thinning import farthest_in_blocks
 
+try:
+    import fpsample
+except ImportError:  # Python 3.13, for which it has no wheel: plain steps, smaller blocks
+    fpsample = None
+
 NEAR_ORIGIN_SQ = 1e-3  # the released code's threshold on |x|^2
 BUCKETS_PAY = 2**16  # from this many distances on
-LARGE = 2**18  # points; more are sampled in blocks,
-LARGE_SHARE = 64  # unless so few are wanted that blocks would hold too few of them
+LARGE = 2**18 if fpsample else 2**14  # points; more are sampled in blocks
+LARGE_BLOCK = None if fpsample else 2**12  # of so many points, None the default,
+LARGE_SHARE = 64 if fpsample else 4  # unless so few are wanted that blocks would hold too few of them
 
 
 def farthest_points(points: Tensor, m: int, *, start: int | Tensor = 0, skip_near_origin: bool = False) -> Tensor:
@@ -59,7 +64,12 @@ def farthest_points_large(points: np.ndarray | Tensor, m: int, *, step: Step = u
         step(1, 1)
         return chosen
     return farthest_in_blocks(
-        array, m, lambda part, number: _farthest(part, number, 0), threads=torch.get_num_threads(), step=step
+        array,
+        m,
+        lambda part, number: _farthest(part, number, 0),
+        threads=torch.get_num_threads(),
+        size=LARGE_BLOCK,
+        step=step,
     )
 
 
@@ -133,12 +143,26 @@ def _farthest_off_origin(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
 def _greedy(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
     """Bucket sampler (QuickFPS) where it pays; it counts its start in its own tree's order."""
     n = len(xyz)
+    if fpsample is None:
+        return _greedy_steps(xyz, m, start)
     if n >= 16 and m * n > BUCKETS_PAY:
         height = max(3, round(np.log2(n) / 2 - 1))
         chosen = fpsample.bucket_fps_kdline_sampling(xyz, m, height, _tree_slot(xyz, height, start))
         if chosen[0] == start:
             return chosen.astype(np.int64)
     return fpsample.fps_sampling(xyz, m, start).astype(np.int64)
+
+
+def _greedy_steps(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
+    axes, step = np.ascontiguousarray(xyz.T), np.empty_like(xyz.T, order="C")
+    dist_sq, chosen = np.full(len(xyz), np.inf, np.float32), np.empty(m, np.int64)
+    for i in range(m):
+        chosen[i] = start
+        np.subtract(axes, axes[:, start, None], out=step)
+        np.multiply(step, step, out=step)
+        np.minimum(dist_sq, step.sum(0), out=dist_sq)
+        start = int(dist_sq.argmax())
+    return chosen
 
 
 def _tree_slot(xyz: np.ndarray, height: int, start: int) -> int:
