@@ -108,8 +108,8 @@ def write(path: str | PathLike[str], content: Mapping[str, Any]) -> None:
     """Write a checkpoint, whole or not at all."""
     buffer = io.BytesIO()  # where torch itself writes to a full disk, its error does not say so
     torch.save(dict(content), buffer)
-    with atomic_path(Path(path)) as temporary, buffer.getbuffer() as raw:
-        temporary.write_bytes(raw)
+    with atomic_path(Path(path)) as temporary, temporary.open("wb") as file, buffer.getbuffer() as raw:
+        file.write(raw)
 
 
 def fill(network: nn.Module, state: Mapping[str, Tensor], source: str | PathLike[str]) -> None:
