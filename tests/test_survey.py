@@ -44,3 +44,8 @@ def test_uneven_clouds_are_told() -> None:
 
 def test_the_smallest_cloud() -> None:
     assert np.isfinite(survey(sphere(16))[:]).all()
+
+
+def test_noise_is_a_number_where_no_neighbours_look_the_same_way() -> None:
+    normals = np.eye(3)[np.arange(20) % 3]  # at most seven of the 16 neighbours have the normal of a place
+    assert survey(sphere(20), normals).noise == 0

@@ -1,5 +1,7 @@
 """How noisy a cloud is."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -18,7 +20,7 @@ def noise_level(points: Tensor, normals: Tensor | None = None) -> float:
     Residual of quadratic fits to small neighbourhoods, at the quietest tenth of a thousand places. Good to about a
     quarter from 0.1 to 0.8 spacings; below, it is an upper bound: curvature that the points do not resolve counts as
     noise, and so do walls that are thin beside the spacing, unless `normals` (n, 3) tell their sides apart.
-    0 for fewer than 16 points.
+    0 where there are too few points to tell: fewer than 16, or hardly ten of like side around most places.
     """
     xyz = points.detach().double()
     level = 0.0
@@ -30,7 +32,10 @@ def noise_level(points: Tensor, normals: Tensor | None = None) -> float:
         weight = torch.ones_like(dist_sq)
         if normals is not None:
             weight = ((normals[idx] * normals[places, None]).sum(-1) > 0.3).double()
-        level = _residuals(xyz[idx], weight).quantile(QUIET).item()
+        quietest = _residuals(xyz[idx], weight).quantile(QUIET).item()
+        if not math.isfinite(quietest):
+            continue
+        level = quietest
         if level < enough * dist_sq[:, 1:6].sqrt().mean(1).median().item():
             break
     return level
