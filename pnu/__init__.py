@@ -3,7 +3,7 @@
 A *cloud* is an `(n, 6)` array of points and unit normals; an *upsampler* turns a cloud into a denser one.
 
     import pnu
-    dense = pnu.upsample(points, ratio=4)       # (4 n, 6)
+    dense = pnu.upsample(points, ratio=4)       # (n, 3), or (n, 6) with normals -> (4 n, 6)
     network = pnu.load("outputs/...")           # a trained network, in eval mode
 """
 
@@ -28,3 +28,7 @@ def __getattr__(name: str) -> Any:
 
         return upsample
     raise AttributeError(f"module 'pnu' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

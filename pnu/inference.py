@@ -5,6 +5,7 @@ import hashlib
 import math
 from contextlib import ExitStack
 from functools import partial
+from numbers import Integral
 from os import PathLike
 from pathlib import Path
 from typing import Any, Protocol, cast, runtime_checkable
@@ -63,23 +64,25 @@ def upsample(
 ) -> np.ndarray:
     """A denser cloud on the same surface.
 
-    The procedure of the paper (section Inference): patches around farthest points are brought to the unit sphere, go
-    through the network and back, and farthest points of all predictions are kept. In addition every input point
-    lies in a patch, and passes are repeated for ratios beyond the network's. The result depends neither on the order of
-    the points nor on repeated ones; a cloud of fewer than 64 points fills a patch by repetition.
+    A network of patches is used as in the paper (section Inference): patches around farthest points are brought to the
+    unit sphere, go through the network and back, and farthest points of all predictions are kept. In addition every
+    input point lies in a patch, passes are repeated for ratios beyond the network's, and a cloud of fewer than 64
+    points fills a patch by repetition. A `CloudUpsampler`, such as "surface", takes the cloud as a whole. The result
+    depends neither on the order of the points nor on repeated ones.
 
     Args:
-        points: (n, 3), n >= 16, in any unit and anywhere.
-        normals: (n, 3), of any length but zero; estimated and oriented where missing.
+        points: (n, 3), or (n, 6) with normals, n >= 16, in any unit and anywhere.
+        normals: (n, 3), of any length but zero; estimated and oriented where missing here and in points.
         ratio: points out for each point in, any number >= 1.
         model: network, run folder, file of weights, or the name of weights that come with pnu (`pnu.weights`):
             "surface" takes those made for estimated normals where none are given. None: the newest finished run under
             outputs/, or "surface" where there is none.
-        patch_size: points of a patch; default: what the network was made for (1024).
+        patch_size: points of a patch, at least 16; None: what the network was made for. "surface" has no patches.
         device: "auto" (where the given network is; else CUDA where there is one), "cpu", "cuda", "cuda:1" ...
         devices: CUDA devices, or processes on the CPU, that share the work of the network; the result is the same for
             any number. More than one needs `if __name__ == "__main__":` in a script.
-        batch_size: patches at once on a GPU, by default 64; on the CPU each thread takes one.
+        batch_size: patches at once on a GPU, by default 64; on the CPU each thread takes one. Of "surface": points at
+            once, by default 65536 on a GPU and 512 a thread on the CPU.
         seed: of models that draw random numbers; the paper's procedure draws none.
         progress: called as progress(stage, done, total).
         parts: folder for finished parts of a long computation; the same call goes on from them after an interruption.
@@ -91,12 +94,13 @@ def upsample(
         ValueError: in one line, which argument is wrong and what was expected.
     """
     progress = progress or (lambda stage, done, total: None)
-    given = check_cloud(Cloud(np.asarray(points), normals, {}), "points", minimum=MINIMUM)
+    given = _given(points, normals)
     count = output_count(len(given.points), ratio)
-    for name, value in (("patch_size", patch_size), ("batch_size", batch_size), ("devices", devices)):
-        if value is not None and value < 1:
-            raise ValueError(f"{name}={value}: expected a whole number >= 1")
-    network, target = _on_device(model if isinstance(model, nn.Module) else source(model, normals), device)
+    sizes = (("patch_size", patch_size, MINIMUM), ("batch_size", batch_size, 1), ("devices", devices, 1))
+    for name, value, least in sizes:
+        if value is not None and not (isinstance(value, Integral) and value >= least):
+            raise ValueError(f"{name}={value}: expected a whole number >= {least}")
+    network, target = _on_device(model if isinstance(model, nn.Module) else source(model, given.normals), device)
     upsampler = _upsampler(network, patch_size)
     sparse, frame = _prepare(given, progress)
     generator = torch.Generator().manual_seed(seed)
@@ -157,6 +161,22 @@ def newest_run() -> Path:
     if run is None:
         raise ValueError("run: no finished run under outputs/; train one with `make train`, or give run=FOLDER")
     return run
+
+
+def _given(points: np.ndarray, normals: np.ndarray | None) -> Cloud:
+    """The cloud that points (n, 3) or (n, 6) and normals (n, 3) describe, checked."""
+    expected = "points: expected an array (n, 3), or (n, 6) with normals"
+    try:
+        array = np.asarray(points, np.float64)
+    except ValueError:
+        raise ValueError(f"{expected}, found {type(points).__name__}") from None
+    if array.ndim != 2 or array.shape[1] not in (3, 6):
+        raise ValueError(f"{expected}, found shape {array.shape}")
+    if array.shape[1] == 6:
+        if normals is not None:
+            raise ValueError("normals: are in points (n, 6) already; give points (n, 3), or no normals beside them")
+        array, normals = array[:, :3], array[:, 3:]
+    return check_cloud(Cloud(array, normals, {}), "points", minimum=MINIMUM)
 
 
 def _on_device(model: nn.Module | str | PathLike[str], device: str) -> tuple[nn.Module, torch.device]:

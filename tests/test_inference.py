@@ -108,6 +108,13 @@ def test_patch_size_and_small_clouds() -> None:
     assert len(network.seen[0][0].unique(dim=0)) == 40
 
 
+def test_normals_may_stand_beside_the_points() -> None:
+    points = sphere(100)
+    both = np.hstack([points, 2 * points])
+    for model in (Spread(), "surface"):  # the weights too are those for given normals
+        np.testing.assert_array_equal(upsample(both, model=model), upsample(points, 2 * points, model=model))
+
+
 def test_every_input_point_is_covered() -> None:
     """A network that repeats its input gives back each point, also of a far and sparse second piece."""
     rng = np.random.default_rng(1)
@@ -249,14 +256,17 @@ BAD = {
     "huge ratio": ({"ratio": 1e9}, r"^ratio=1e\+09: asks for 20000000000 points, at most 1e\+09 are made"),
     "few": ({"points": GOOD[:15]}, "^points: holds 15 points; at least 16 are needed$"),
     "few different": ({"points": GOOD[[0, 1] * 10]}, "^points: holds 2 different points; at least 16 are needed$"),
-    "shape": ({"points": np.zeros((20, 6))}, r"^points: expected points of shape \(n, 3\), found \(20, 6\)"),
+    "shape": ({"points": np.zeros((20, 5))}, r"^points: expected an array \(n, 3\), or .*, found shape \(20, 5\)$"),
+    "type": ({"points": "scan.ply"}, r"^points: expected an array \(n, 3\), or \(n, 6\) with normals, found str$"),
     "equal": ({"points": np.ones((20, 3))}, "^points: all 20 points are equal"),
     "nan": ({"points": np.where(ZERO == 0, np.nan, GOOD)}, "^points: 1 of 20 points hold NaN"),
     "zero normal": ({"normals": ZERO}, r"^points: 1 of 20 normals have length zero \(the first: number 4\)"),
+    "normals twice": ({"points": np.hstack([GOOD, GOOD]), "normals": GOOD}, "^normals: are in points"),
     "normals": ({"normals": GOOD[:5]}, r"^points: expected normals of shape \(20, 3\), found \(5, 3\)"),
     "device": ({"device": "tpu"}, "^device=tpu: is not here; expected auto, cpu, or cuda"),
     "batch": ({"batch_size": 0}, "^batch_size=0: expected a whole number >= 1"),
-    "patch": ({"patch_size": -1}, "^patch_size=-1: expected a whole number >= 1"),
+    "patch": ({"patch_size": 15}, "^patch_size=15: expected a whole number >= 16"),
+    "part of a patch": ({"patch_size": 64.5}, "^patch_size=64.5: expected a whole number >= 16"),
     "run": ({"model": "nowhere"}, "expected a run folder.*found no folder"),
     "prediction": ({"model": Spread(step=float("nan"))}, "^model: predicted points that are NaN or infinite"),
 }
@@ -275,7 +285,7 @@ def test_public_function_survives_the_import_of_its_module() -> None:
         "import pnu, pnu.inference as i; assert pnu.upsample is i.upsample; import pnu.upsample; pnu.upsample(points=1)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert "ValueError: points: expected points of shape (n, 3), found ()" in done.stderr
+    assert "ValueError: points: expected an array (n, 3), or (n, 6) with normals, found shape ()" in done.stderr
 
 
 @pytest.mark.slow

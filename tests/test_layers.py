@@ -23,7 +23,7 @@ LAYERS = [
     {"pnu.classical"},
     {"pnu.evaluation"},
     {"pnu.comparison"},
-    {"pnu.run", "pnu.schema"},
+    {"pnu.run"},
     {"pnu.study"},
     {"pnu.lit", "pnu.callbacks"},
 ]
@@ -127,7 +127,11 @@ def loaded_by(statement: str) -> set[str]:
 
 
 def test_import_is_light() -> None:
-    assert not loaded_by("import pnu") & HEAVY
+    assert not loaded_by("import pnu; dir(pnu)") & HEAVY
+
+
+def test_the_public_functions_are_listed_before_their_first_use() -> None:
+    assert {"load", "upsample"} <= loaded_by("import pnu; print(*dir(pnu))")
 
 
 def test_heavy_import_would_be_seen() -> None:
