@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Mapping
+from datetime import timedelta
 from typing import Any
 
 import lightning.pytorch as pl
@@ -141,8 +142,8 @@ class ProgressBar(pl.Callback):
         if not self.bar.console.is_terminal:
             seconds, steps = time.monotonic() - self.started_at[0], trainer.global_step - self.started_at[1]
             total = self.bar.tasks[0].total
-            left = f", {(total - trainer.global_step) * seconds / steps:.0f} s left" if total and steps else ""
-            print(f"step {trainer.global_step}: {self.validation} ({seconds:.0f} s{left})", flush=True)
+            left = f", {clock((total - trainer.global_step) * seconds / steps)} left" if total and steps else ""
+            print(f"step {trainer.global_step}: {self.validation} ({clock(seconds)}{left})", flush=True)
 
     def on_train_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if trainer.is_global_zero:
@@ -151,6 +152,11 @@ class ProgressBar(pl.Callback):
     def on_exception(self, trainer: pl.Trainer, module: pl.LightningModule, exception: BaseException) -> None:
         if hasattr(self, "bar"):
             self.bar.stop()
+
+
+def clock(seconds: float) -> str:
+    """Hours, minutes and seconds, 0:02:43, after days where there are any."""
+    return str(timedelta(seconds=round(seconds)))
 
 
 class Pictures(pl.Callback):

@@ -21,7 +21,9 @@ class Compare:
     methods: list[str] = doc(
         "run folders, folders of a sweep, and apss, poisson, midpoint; NAME:FOLDER gives a run another name"
     )
-    data: Data = doc("synthetic, or meshes with data.root=FOLDER: meshes, or prepared pairs in clouds/ and truth/")
+    data: Data = doc(
+        "Shapes: procedural, or of data=meshes data.root=FOLDER, meshes or prepared pairs in clouds/ and truth/"
+    )
     part: str | None = doc("of the shapes: train, val, test, all; null: test of the procedural ones, all of a folder")
     shapes: list[str] | None = doc("names of the shapes to take; null: all of the part")
     kinds: list[str] = doc(

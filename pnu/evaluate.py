@@ -22,7 +22,9 @@ class Evaluate:
         "run folder, or name or file of weights; null: the newest finished run under outputs/, or `method`"
     )
     method: str | None = doc("upsampler without training instead of a run: apss, poisson or midpoint")
-    data: Data = doc("synthetic, or meshes with data.root=FOLDER: meshes, or prepared pairs in clouds/ and truth/")
+    data: Data = doc(
+        "Shapes: procedural, or of data=meshes data.root=FOLDER, meshes or prepared pairs in clouds/ and truth/"
+    )
     part: str | None = doc("of the shapes: train, val, test, all; null: test of the procedural ones, all of a folder")
     shapes: list[str] | None = doc("names of the shapes to take; null: all of the part")
     kinds: list[str] = doc(

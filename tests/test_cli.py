@@ -79,6 +79,11 @@ def test_help_tells_every_key_with_its_value(tmp_path: Path) -> None:
     assert "model=" in done.stdout
 
 
+def test_help_tells_the_keys_of_a_command_before_those_of_groups() -> None:
+    done = subprocess.run([sys.executable, "-m", "pnu.evaluate", "--help"], capture_output=True, text=True, check=True)
+    assert done.stdout.index("truth_points=") < done.stdout.index("data.val_share=")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -77,7 +77,7 @@ def parse(overrides: list[str]) -> list[Any]:
     return parsed
 
 
-def variations(overrides: list[str], extra_folder: str | None = None) -> Iterator[list[str]]:
+def variations(overrides: list[str]) -> Iterator[list[str]]:
     """Override lists in which each value of each sweep (`a=1,2 b=x,y`) appears once: the sum, not the product."""
     parsed = parse(overrides)
     values = []

@@ -1,6 +1,7 @@
 """The text of `--help`: every key with its present value and its line of documentation."""
 
 import dataclasses
+import inspect
 import typing
 from typing import Any
 
@@ -23,7 +24,8 @@ def help_text(schema: type, program: str, cfg: Any) -> str:
 
     def describe(schema: type, cfg: Any, prefix: str) -> None:
         hints = typing.get_type_hints(schema)
-        for name, field in fields(schema).items():
+        # groups last: keys of the command itself below a group would look like the group's
+        for name, field in sorted(fields(schema).items(), key=lambda item: dataclasses.is_dataclass(hints[item[0]])):
             key = f"{prefix}{name}"
             # `in cfg` would leave out those that are still ???; underscores are Hydra's, set by the choice of a group
             if name not in list(cfg) or name.startswith("_"):
@@ -40,4 +42,4 @@ def help_text(schema: type, program: str, cfg: Any) -> str:
 
     describe(schema, cfg, "")
     usage = f"usage: {program} [key=value ...]      (-m key=a,b: one run for each value)"
-    return "\n".join([usage, "", (schema.__doc__ or "").strip(), "", *lines])
+    return "\n".join([usage, "", inspect.getdoc(schema) or "", "", *lines])
