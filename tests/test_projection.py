@@ -283,9 +283,15 @@ def test_noisy_points_are_smoothed_first() -> None:
     assert {"projection", "refinement 1", "refinement 2"} <= stages
 
 
-def test_no_refinement_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"model\.refinements=0: expected at least 1"):
-        Surface(refinements=0)
+@pytest.mark.parametrize("name", ["rounds", "seeds", "candidates", "shortlist", "refinements"])
+def test_less_than_one_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=rf"model\.{name}=0: expected at least 1"):
+        Surface(**{name: 0})
+
+
+def test_a_negative_share_of_rejected_points_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"model\.reject=-0\.1: expected a share"):
+        Surface(reject=-0.1)
 
 
 def test_training_seeds_are_spread_and_pushed_outward() -> None:

@@ -87,7 +87,7 @@ class Projector(nn.Module):
 
 
 class Surface(nn.Module):
-    """Upsampling by learned projection: seeds, projection, farthest points, even spacing, projection, rejection.
+    """Upsampling by learned projection: seeds, spheres, projection of a shortlist, even spacing, projection, rejection.
 
     Args:
         ratio: points out for each point in, where none is asked for (`upsample_cloud` takes any count).
@@ -96,8 +96,8 @@ class Surface(nn.Module):
         width: of the network.
         rounds: projections in training; at work there are 1 + `refinements`.
         seeds: seeds for each point wanted.
-        candidates: seeds for each point wanted after they were thinned out to an even spacing; each moves to a sphere.
-        shortlist: of those, for each point wanted, thinned out again for the network.
+        candidates: of them, after thinning out to an even spacing; each moves to a sphere.
+        shortlist: of those, thinned out again; the network projects these, and farthest points of them stay.
         relaxation: steps of even spacing.
         refinements: projections after it; one more is nearer to the surface and a little less even.
         reject: share of the points that is made too many; the worst of
@@ -117,15 +117,18 @@ class Surface(nn.Module):
         queries: int = 64, sphere: bool = True, attention: bool = True,
     ) -> None:  # fmt: skip
         super().__init__()
+        self.ratio, self.neighbours, self.reach, self.rounds = ratio, neighbours, reach, rounds
+        self.seeds, self.candidates, self.shortlist = seeds, candidates, shortlist
+        self.relaxation, self.refinements, self.reject, self.queries = relaxation, refinements, reject, queries
         if not 4 <= neighbours <= reach:
             raise ValueError(
                 f"model.reach={reach}: expected at least model.neighbours={neighbours}, which is at least 4"
             )
-        if refinements < 1:
-            raise ValueError(f"model.refinements={refinements}: expected at least 1")
-        self.ratio, self.neighbours, self.reach, self.rounds = ratio, neighbours, reach, rounds
-        self.seeds, self.candidates, self.shortlist = seeds, candidates, shortlist
-        self.relaxation, self.refinements, self.reject, self.queries = relaxation, refinements, reject, queries
+        if reject < 0:
+            raise ValueError(f"model.reject={reject}: expected a share of the points, 0 or more")
+        for name in ("rounds", "seeds", "candidates", "shortlist", "refinements"):
+            if getattr(self, name) < 1:  # too few seeds would be too few points
+                raise ValueError(f"model.{name}={getattr(self, name)}: expected at least 1")
         self.projector = Projector(width, sphere=sphere, attention=attention)
 
     def outputs(self, patch: Tensor) -> dict[str, Tensor]:
