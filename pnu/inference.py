@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from pnu import checkpoint
+from pnu import __version__, checkpoint
 from pnu.io import Cloud, check_cloud
 from pnu.models.surface import Surface
 from pnu.ops import patches, threads
@@ -222,8 +222,13 @@ def _digest(network: nn.Module, sparse: Tensor, count: int, upsampler: object) -
     digest = hashlib.sha256(sparse.numpy().tobytes())
     for name, value in network.state_dict().items():
         digest.update(name.encode() + value.cpu().numpy().tobytes())
-    plain = {k: v for k, v in vars(upsampler).items() if isinstance(v, int | float | str)}
-    digest.update(repr((type(network).__name__, count, sorted(plain.items()), torch.__version__)).encode())
+    plain = [
+        (name, value)
+        for module in (upsampler, *network.modules())
+        for name, value in sorted(vars(module).items())
+        if name != "training" and isinstance(value, int | float | str)
+    ]
+    digest.update(repr((type(network).__name__, count, plain, __version__, torch.__version__)).encode())
     return digest.hexdigest()[:16]
 
 

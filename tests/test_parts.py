@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from pnu import inference
+from pnu.checkpoint import load
 from pnu.inference import upsample
 from pnu.models import surface
 from pnu.models.pnu import PNU
@@ -70,6 +71,15 @@ def test_parts_of_another_task_are_not_taken(tmp_path: Path) -> None:
         found = upsample(**options, parts=tmp_path)
         np.testing.assert_array_equal(found, upsample(**options))
     assert len(list(tmp_path.iterdir())) == 5
+
+
+def test_parts_of_a_network_with_other_options_are_not_taken(tmp_path: Path) -> None:
+    points = sphere(300)
+    for sphere_first in (True, False):
+        network = surface.Surface(sphere=sphere_first)
+        network.load_state_dict(load("surface").state_dict())
+        found = upsample(points, points, model=network, parts=tmp_path)
+        np.testing.assert_array_equal(found, upsample(points, points, model=network))
 
 
 def test_threads_do_not_matter() -> None:
