@@ -1,1 +1,1 @@
-"""Measurements of speed, one small script each; `python -m bench` runs them all. Never part of the tests."""
+"""Measurements, one small script each: `python -m bench` runs those of speed. Never part of the tests."""

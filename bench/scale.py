@@ -17,7 +17,6 @@ from pnu import weights
 from pnu.models.pnu import PNU
 
 SHORT = [10_000, 30_000, 100_000]
-FULL = [*SHORT, 300_000, 1_000_000]
 RUN = """
 import json, re, sys, time
 from pathlib import Path
