@@ -13,7 +13,9 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
+import pnu
 from pnu.run import RunFolder, build, command, compose_config, doc
+from pnu.run.command import renamed
 from pnu.run.config import composer, config_folder, flatten, variations
 from pnu.run.folder import config_hash, new_path
 from pnu.run.schema import check, fields, known_keys, nearest_key
@@ -116,7 +118,7 @@ def test_defaults_are_the_papers() -> None:
         ("resume=maybe", r"resume=maybe: expected bool \("),
         ("trainer.max_time=[1]", r"trainer\.max_time=\[1\]: expected str or null \("),
         ("loss=3", r"loss=3: expected one of"),
-        ("loss.w1=[", r"cannot read 'loss\.w1=\[': expected key=value"),
+        ("loss.w1=[", r"cannot read 'loss\.w1=\[': special characters want quotes, 'loss\.w1=\"\[\"'$"),
         ("--what", r"cannot read '--what': expected key=value"),
         ("scheduler.max_lr=1", r"key 'scheduler\.max_lr' has no use with this scheduler"),
     ],
@@ -235,7 +237,14 @@ def test_command_ends_well_and_writes_nothing_of_its_own(script: Any, tmp_path: 
 
 
 @pytest.mark.parametrize(
-    "arguments", [["output=b"], ["input=a", "output=b", "ratio=0.5"], ["input=a", "output=b", "ratoi=2"]]
+    "arguments",
+    [
+        ["output=b"],
+        ["input=a", "output=b", "ratio=0.5"],
+        ["input=a", "output=b", "ratoi=2"],
+        ["input=a", "output=b", "ratio=2,4"],  # without -m
+        ["input=a (1).ply", "output=b"],
+    ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(script: Any, arguments: list[str]) -> None:
     done = script(*arguments)
@@ -243,6 +252,18 @@ def test_bad_input_is_one_line_and_exit_code_2(script: Any, arguments: list[str]
     assert done.stdout == ""
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["a (1).ply", "a=b.ply", "a,b.ply", "a b/c.ply"])
+def test_the_quotes_that_a_message_asks_for_help(script: Any, name: str) -> None:
+    done = script(f'input="{name}"', "output=b")
+    assert (done.returncode, done.stdout) == (0, "worked 4.0\n")
+
+
+def test_home_is_expanded_and_the_version_is_ours() -> None:
+    assert renamed("model=~/run", {"model": "run"}) == f"run={Path.home()}/run"
+    done = subprocess.run([sys.executable, "-m", "pnu.train", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == f"pnu {pnu.__version__}\n"
 
 
 @pytest.mark.usefixtures("untraced")

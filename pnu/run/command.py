@@ -9,8 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from pnu import __version__
 from pnu.run import search, sweep
-from pnu.run.config import check_keys, composer, config_folder, in_multirun, one_line, variations
+from pnu.run.config import check_keys, check_single, composer, config_folder, in_multirun, one_line, variations
 from pnu.run.help import help_text
 from pnu.run.schema import check, fields
 
@@ -43,6 +44,9 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
             renamed(argument, getattr(schema, "also", {})) for argument in (sys.argv[1:] if argv is None else argv)
         ]
         arguments = sorted(given, key=is_override)
+        if "--version" in arguments:  # Hydra would tell its own
+            print(f"pnu {__version__}")
+            return
         # before torch is there: on a busy machine, threads that spin while they wait make a step take seconds
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         program = f"python -m pnu.{name}" if sys.argv[0].endswith(".py") else Path(sys.argv[0]).name
@@ -57,6 +61,8 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
                 if parsed.help:
                     print(help_text(schema, program, check(compose(overrides), schema, complete=False)))
                     return
+                if not parsed.multirun:
+                    check_single(overrides)
                 if goes_on:
                     added = sweep.arguments(overrides, name)
                     arguments += added
@@ -97,7 +103,10 @@ def is_override(argument: str) -> bool:
 
 
 def renamed(argument: str, names: Mapping[str, str]) -> str:
+    """An argument as Hydra shall see it: the key by its first name, and ~/ expanded, which shells leave after `=`."""
     key, equals, value = argument.partition("=")
+    if value.startswith("~/"):
+        value = str(Path(value).expanduser())
     return f"{names.get(key, key)}{equals}{value}"
 
 

@@ -71,9 +71,9 @@ def parse(overrides: list[str]) -> list[Any]:
         try:
             parsed += parser.parse_overrides([override])
         except HydraException:
-            raise ValueError(
-                f"cannot read {override!r}: expected key=value, quotes around special characters"
-            ) from None
+            key, equals, value = override.partition("=")
+            hint = f"special characters want quotes, '{key}=\"{value}\"'" if equals else "expected key=value"
+            raise ValueError(f"cannot read {override!r}: {hint}") from None
     return parsed
 
 
@@ -98,6 +98,16 @@ def variations(overrides: list[str]) -> Iterator[list[str]]:
     for i, options in enumerate(values):
         for option in options[1:]:
             yield list(chain(*first[:i], [option], *first[i + 1 :]))
+
+
+def check_single(overrides: list[str]) -> None:
+    """Refuse several values of a key where one run is wanted."""
+    for raw, override in zip(overrides, parse(overrides), strict=True):
+        if override.is_sweep_override():
+            key, _, value = raw.partition("=")
+            raise ValueError(
+                f"{raw}: for one run with each value, add -m; a comma in a value wants quotes, '{key}=\"{value}\"'"
+            )
 
 
 def check_keys(overrides: list[str], schema: type, compose: Callable[..., Any]) -> None:
