@@ -33,7 +33,7 @@ class Compare:
     truth_points: int = doc("points on the true surface to compare with")
     ratio: float = doc("points out for each point in")
     passes: bool = doc("also networks that were trained for another ratio: by passes and farthest points")
-    normals: str = doc("of the inputs. given: those of the surface or file; estimate: estimated from the points")
+    normals: str = doc("of the inputs: given, those of the shape; estimate, for which surface_estimated is made")
     output: str | None = doc("folder for index.html, metrics.json, metrics.csv, figures/; null: in outputs/comparison/")
     surfaces: list[str] | None = doc("kinds of input whose clouds are made surfaces too; null: the first; []: none")
     shown: int = doc("shapes in the figures and 3D views, the first ones; the tables have all")

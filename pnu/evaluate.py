@@ -34,7 +34,7 @@ class Evaluate:
     truth_points: int = doc("points on the true surface to compare with")
     ratio: float = doc("points out for each point in")
     passes: bool = doc("also where the network was trained for another ratio: by passes and farthest points")
-    normals: str = doc("of the inputs. given: those of the surface or file; estimate: estimated from the points")
+    normals: str = doc("of the inputs: given, those of the shape; estimate, for which run=surface_estimated is made")
     search: str = doc("for closest surface points. exact; open3d: as other scripts (differs in the faces at edges)")
     output: str | None = doc("folder for metrics.json and metrics.csv; null: evaluation/ in the run, or in outputs/")
     save: bool = doc("write the upsampled clouds too, in the frame of the comparison, to the folder's clouds/")
