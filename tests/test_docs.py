@@ -37,6 +37,10 @@ SHORT = {
     "pnu.evaluate": ["shapes=[mug]", "kinds=[uniform]", "points=300", "truth_points=1200"],
     "pnu.compare": ["shapes=[mug]", "kinds=[uniform]", "points=300", "truth_points=1200", "size=64"],
 }
+CROPS = [
+    *("data.validation=[mug]", "data.clouds=8", "data.size=128", "data.batch_size=4", "data.points=128", "threads=1"),
+    *("trainer.max_steps=2", "trainer.accelerator=cpu", "trainer.val_check_interval=1", "callbacks.pictures.clouds=0"),
+]  # of a training of `surface`
 SWEPT = ["setting=default", "seed=0"]  # of an ablation
 PRELUDE = "from pnu.io import read_cloud\npoints = read_cloud('scan.ply').points\n"  # what the README takes as given
 
@@ -83,8 +87,10 @@ def run(folder: Path, command: list[str]) -> None:
 
 
 def filled(folder: Path, line: str) -> str:
-    """A line with names of this folder where the page has FOLDER, FILE and outputs/..."""
+    """A line with names of this folder where the page has FOLDER, MESHES, FILE, outputs/... and what took hours."""
     line = line.replace("data.root=FOLDER", "data.root=meshes").replace("output=FOLDER", "output=converted")
+    line = line.replace("data.root=MESHES", "data.root=meshes")
+    line = re.sub(r"(outputs/quality|FOLDER/truth)/[\w/]+\.ply", "mesh.ply", line)
     if "outputs/..." in line:
         run = max(folder.glob("outputs/*/*_train"), default=None, key=lambda path: path.stat().st_mtime)
         line = line.replace("outputs/...", str(run.relative_to(folder)) if run else "surface")
@@ -111,7 +117,7 @@ def run_line(folder: Path, line: str) -> None:
         arguments = [argument.replace("poisson", "midpoint") for argument in arguments]
     given = {argument.partition("=")[0] for argument in arguments}
     if not given & {"describe", "resume"}:
-        short = SHORT.get(arguments[1], [])
+        short = CROPS if "ablation=surface" in arguments else SHORT.get(arguments[1], [])
         keep = {"shapes", "kinds", "points"} & given
         arguments += [option for option in short if option.partition("=")[0] not in keep]
         arguments += SWEPT if "ablation" in given else []
