@@ -448,7 +448,7 @@ def test_hidden_files_are_no_meshes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("with_normals", [False, True])
 def test_npy_in_slices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, with_normals: bool) -> None:
-    monkeypatch.setattr("pnu.io.cloud.SLICE", 7)
+    monkeypatch.setattr("pnu.io.output.SLICE", 7)
     cloud = np.random.default_rng(0).normal(size=(40, 6))
     cloud[:, 3:] /= np.linalg.norm(cloud[:, 3:], axis=1, keepdims=True)
     write_cloud(tmp_path / "a.npy", cloud[:, :3], cloud[:, 3:] if with_normals else None)

@@ -1,9 +1,10 @@
 """Files: the only room that knows formats. What is read is checked; what is written appears whole or not at all."""
 
 from pnu.io.atomic import atomic_path, check_writable, read_json, remove_leftovers, write_json
-from pnu.io.cloud import CLOUD_SUFFIXES, Cloud, check_cloud, check_output, keeps_attributes, read_cloud, write_cloud
+from pnu.io.cloud import CLOUD_SUFFIXES, Cloud, check_cloud, read_cloud
 from pnu.io.folder import files_of, meshes_of
 from pnu.io.mesh import MESH_SUFFIXES, Mesh, read_mesh, write_mesh
+from pnu.io.output import check_output, keeps_attributes, write_cloud
 
 __all__ = [
     "CLOUD_SUFFIXES",
