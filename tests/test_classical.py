@@ -113,7 +113,7 @@ def test_unknown_method() -> None:
 def test_apss_is_as_good_as_known(shared: Path) -> None:
     found = []
     for shape in ("casting", "duck", "fandisk", "camel", "elephant", "kitten"):
-        points, normals, _ = read_cloud(shared / "bench" / "clouds" / f"{shape}.xyz")
+        points, normals, *_ = read_cloud(shared / "bench" / "clouds" / f"{shape}.xyz")
         dense = inference.upsample(points, normals, model=classical.method("apss"))
         truth = np.load(shared / "bench" / "truth" / f"{shape}_20000.npy")
         close = metrics.compare_mesh(dense, read_mesh(shared / "bench" / "truth" / f"{shape}.ply"))

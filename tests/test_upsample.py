@@ -62,7 +62,7 @@ def test_newest_run_and_report(place: Path) -> None:
 
 def test_given_run_quiet_and_estimated_normals(place: Path) -> None:
     run = make_run(place / "elsewhere")
-    points, normals, _ = read_cloud(place / "cloud.ply")
+    points, normals, *_ = read_cloud(place / "cloud.ply")
     np.save(place / "points.npy", points)
     write_cloud(place / "inward.ply", points, -normals, {"colors": np.zeros((200, 3), np.uint8)})
     done = upsample(place, "input=points.npy", "output=a.npy", f"run={run}", "ratio=2")

@@ -108,7 +108,7 @@ def pair_cases(
         if shapes is not None and path.stem not in shapes:
             continue
         truth, frame = read_truth(Path(root) / "truth", path.stem, truth_points, seed, warn)
-        points, given, _ = read_cloud(path, normals=normals)
+        points, given, *_ = read_cloud(path, normals=normals)
         points = moved(points, frame)
         check_frame(points, truth, path)
         yield Case("given", points, given, truth)

@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pnu.io.fields import arranged, as_colors
 from pnu.io.las import read_las
-from pnu.io.mesh import Geometry, as_colors, read_obj, read_off
+from pnu.io.mesh import Geometry, read_obj, read_off
 from pnu.io.pcd import read_pcd
 from pnu.io.ply import read_ply
 from pnu.io.text import open_file, table, text_lines
@@ -20,11 +21,13 @@ class Cloud(NamedTuple):
     """Points (n, 3) float64, unit normals (n, 3) float64 or None, and what else the file says about each point.
 
     attributes: name -> (n,) or (n, k). Colours are "colors", (n, 3) or (n, 4) uint8.
+    notes: what was found and done while it was read, a line each: left out, taken for something, changed.
     """
 
     points: np.ndarray
     normals: np.ndarray | None
     attributes: dict[str, np.ndarray]
+    notes: tuple[str, ...] = ()
 
 
 @np.errstate(invalid="ignore", over="ignore")  # what is not finite is named by the checks
@@ -81,7 +84,7 @@ def check_cloud(cloud: Cloud, name: str, *, minimum: int = 16) -> Cloud:
                 f"{name}: {len(bad)} of {count} normals have length zero (the first: number {bad[0] + 1}); {cure}"
             )
         normals = normals / lengths
-    return Cloud(points, normals, dict(cloud.attributes))
+    return Cloud(points, normals, dict(cloud.attributes), cloud.notes)
 
 
 def _read_text(path: Path) -> Cloud:
@@ -129,34 +132,26 @@ def _from_table(path: Path, values: np.ndarray) -> Cloud:
 
 def _read_ply(path: Path) -> Cloud:
     columns = {name: v for name, v in read_ply(path, {"vertex"}).get("vertex", {}).items() if isinstance(v, np.ndarray)}
-    return _from_columns(path, columns, NORMAL_FIELDS[".ply"])
+    return _from_columns(path, columns)
 
 
 def _read_pcd(path: Path) -> Cloud:
     columns = read_pcd(path)
-    for name in ("rgb", "rgba"):
-        packed = columns.pop(name, None)
-        if packed is not None and packed.ndim == 1 and packed.itemsize == 4:
+    for name in [name for name in columns if name.lower() in ("rgb", "rgba")]:
+        packed = columns[name]
+        if packed.ndim == 1 and packed.itemsize == 4:
+            del columns[name]
             blue, green, red, alpha = packed.view(np.uint32)[:, None].view(np.uint8).reshape(-1, 4).T
             columns["colors"] = np.stack([red, green, blue, alpha][: len(name)], axis=1)
-    return _from_columns(path, columns, NORMAL_FIELDS[".pcd"])
+    return _from_columns(path, columns)
 
 
-def _from_columns(path: Path, columns: dict[str, np.ndarray], normal: tuple[str, ...]) -> Cloud:
-    def take(names: tuple[str, ...]) -> np.ndarray | None:
-        if any(name not in columns or columns[name].ndim != 1 for name in names):
-            return None
-        return np.stack([columns.pop(name) for name in names], axis=1)
-
-    points = take(("x", "y", "z"))
-    if points is None:
+def _from_columns(path: Path, columns: dict[str, np.ndarray]) -> Cloud:
+    found = arranged(columns)
+    if found.points is None:
         raise ValueError(f"{path}: expected points with x y z, found {' '.join(columns) or 'none'}; save it again")
-    normals = take(normal)
-    colors = take(("red", "green", "blue", "alpha"))
-    colors = take(("red", "green", "blue")) if colors is None else colors
-    if colors is not None:
-        columns["colors"] = colors if colors.dtype == np.uint8 else as_colors(colors)
-    return Cloud(points.astype(np.float64), normals, columns)
+    attributes = found.others if found.colors is None else found.others | {"colors": found.colors}
+    return Cloud(found.points.astype(np.float64), found.normals, attributes, found.notes)
 
 
 def _read_las(path: Path) -> Cloud:

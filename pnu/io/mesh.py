@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pnu.io.atomic import atomic_path
+from pnu.io.fields import as_colors
 from pnu.io.ply import Lists, read_ply, write_ply
 from pnu.io.text import fan, indices, known_suffix, open_file, table, text_lines
 
@@ -156,12 +157,6 @@ def _obj_faces(path: Path, lines: list[str], vertices: int, normals: int) -> tup
         except ValueError:
             raise ValueError(f"{path}: 'f {line[:40]}' is no face; expected corners such as 1/1/1 or 1") from None
     return indices(path, counts), indices(path, corners), indices(path, named)
-
-
-def as_colors(values: np.ndarray) -> np.ndarray:
-    """uint8 of colours in 0..1 or 0..255."""
-    scale = 255 if np.nanmax(values, initial=0) <= 1 else 1
-    return np.rint(np.clip(np.nan_to_num(values) * scale, 0, 255)).astype(np.uint8)
 
 
 def read_off(path: Path) -> Geometry:

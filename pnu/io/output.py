@@ -7,8 +7,9 @@ import numpy as np
 
 from pnu.io.atomic import atomic_path, check_writable
 from pnu.io.cloud import CLOUD_SUFFIXES, NORMAL_FIELDS, Cloud
+from pnu.io.fields import as_colors
 from pnu.io.las import write_las
-from pnu.io.mesh import Geometry, as_colors, ply_normals, write_obj, write_off, xyz_columns
+from pnu.io.mesh import Geometry, ply_normals, write_obj, write_off, xyz_columns
 from pnu.io.pcd import write_pcd
 from pnu.io.ply import SLICE, write_ply
 from pnu.io.text import known_suffix

@@ -71,7 +71,7 @@ def reconstruct(
     Raises:
         ValueError: unusable points or normals, open3d missing, crash, timeout, no surface; one line with the cure.
     """
-    points, given, _ = check_cloud(Cloud(points, normals, {}), name)
+    points, given, *_ = check_cloud(Cloud(points, normals, {}), name)
     if given is None:
         raise ValueError(f"{name}: has no normals; Poisson reconstruction needs them, estimate them first")
     if depth is not None and not 1 <= depth <= 16:
