@@ -229,6 +229,7 @@ def test_full_disk(tmp_path: Path, cloud: tuple[Array, Array]) -> None:
 
     def write() -> None:
         with atomic_path(tmp_path / "c.xyz") as temporary:
+            temporary.unlink()
             temporary.symlink_to("/dev/full")
             np.savetxt(temporary, cloud[0])
 

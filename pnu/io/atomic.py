@@ -4,6 +4,7 @@ import json
 import math
 import os
 import re
+import stat
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -13,18 +14,25 @@ from typing import Any
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """A temporary name beside `path`, with its suffix; renamed to `path` on success, removed on failure.
+    """A new, empty file beside `path`, with its suffix; renamed to `path` on success, removed on failure.
+
+    A link is written through. A file that is there keeps its mode; a new one gets that of the umask.
 
     Raises `ValueError` where the folder does not exist, `path` is a folder, or the system refuses to write.
     """
     path = Path(path)
     check_writable(path)
-    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:12]}{path.suffix}")
+    target = Path(os.path.realpath(path))
+    temporary = target.with_name(f".{target.stem}.{uuid.uuid4().hex[:12]}{target.suffix}")
     try:
+        kept = stat.S_IMODE(target.stat().st_mode) if target.exists() else None
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666 if kept is None else 0o600))
         yield temporary
         with temporary.open("rb+") as handle:
             os.fsync(handle.fileno())
-        os.replace(temporary, path)
+        if kept is not None:
+            temporary.chmod(kept)
+        os.replace(temporary, target)
     except OSError as error:
         if error.filename not in (None, str(temporary), temporary):
             raise
@@ -47,10 +55,16 @@ def check_writable(path: str | Path) -> None:
     path = Path(path)
     if path.is_dir():
         raise ValueError(f"{path}: is a folder; give the name of a file to write")
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: the folder {path.parent} does not exist; create it first")
-    if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise ValueError(f"{path}: the folder {path.parent} cannot be written to; choose another one")
+    target = Path(os.path.realpath(path))
+    if target.is_symlink():
+        raise ValueError(f"{path}: is a link to itself; remove it")
+    if target.exists() and not target.is_file():
+        raise ValueError(f"{path}: is no regular file; give the name of a file to write")
+    folder = target.parent if path.is_symlink() else path.parent
+    if not folder.is_dir():
+        raise ValueError(f"{path}: the folder {folder} does not exist; create it first")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise ValueError(f"{path}: the folder {folder} cannot be written to; choose another one")
 
 
 def write_json(path: str | Path, content: Any) -> None:
