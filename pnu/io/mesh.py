@@ -1,6 +1,6 @@
 """Triangle meshes: ply, off, obj, stl."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,7 +9,8 @@ import numpy as np
 from pnu.io.atomic import atomic_path
 from pnu.io.fields import as_colors
 from pnu.io.ply import Lists, read_ply, write_ply
-from pnu.io.text import fan, indices, known_suffix, open_file, table, text_lines
+from pnu.io.polygons import triangulate
+from pnu.io.text import indices, known_suffix, open_file, table, text_lines
 
 
 class Mesh(NamedTuple):
@@ -30,7 +31,7 @@ class Geometry(NamedTuple):
 
 @np.errstate(invalid="ignore", over="ignore")  # what is not finite is named by the checks
 def read_mesh(path: str | Path) -> Mesh:
-    """Read a triangle mesh; polygons are cut into fans.
+    """Read a triangle mesh; polygons are cut into triangles.
 
     Raises `ValueError` (one line: file, what was expected, what was found, what to do) for a missing, empty, damaged
     or unknown file, a mesh without faces, corners that are no vertices, coordinates that are not finite.
@@ -109,17 +110,25 @@ def _read_ply(path: Path) -> Geometry:
     if any(not isinstance(vertex.get(axis), np.ndarray) for axis in "xyz"):
         raise ValueError(f"{path}: expected a vertex element with properties x y z; save the file again")
     corners = face.get("vertex_indices", face.get("vertex_index"))
-    faces = fan(corners.counts, corners.values) if isinstance(corners, Lists) else np.empty((0, 3), np.int64)
-    return Geometry(np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float64), faces)
+    vertices = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    faces = np.empty((0, 3), np.int64)
+    if isinstance(corners, Lists):
+        faces = triangulate(vertices, corners.counts, corners.values.astype(np.int64))
+    return Geometry(vertices, faces)
 
 
 def read_obj(path: Path) -> Geometry:
     """Wavefront: v (with colours behind), vn, f. A vertex normal is the mean of those that its corners name."""
-    rows: dict[str, list[str]] = {"v": [], "vn": [], "f": []}
-    for line in text_lines(path):
-        key, _, rest = line.partition("#")[0].strip().partition(" ")
+    rows: dict[str, list[str]] = {"v": [], "vn": []}
+    faces: list[tuple[str, int, int]] = []  # and how many vertices and normals were read before
+    for line in _obj_lines(path):
+        key, *rest = line.split(maxsplit=1)
         if key in rows:
-            rows[key].append(rest)
+            if not rest:
+                raise ValueError(f"{path}: a line has '{key}' and no numbers; expected x y z")
+            rows[key].append(rest[0])
+        elif key == "f":
+            faces.append((rest[0] if rest else "", len(rows["v"]), len(rows["vn"])))
     values = table(path, lambda: rows["v"])
     if values.size and values.shape[1] not in (3, 4, 6, 7):
         raise ValueError(f"{path}: a vertex (v) has {values.shape[1]} numbers; expected 3 (x y z), 4, 6 or 7")
@@ -128,7 +137,7 @@ def read_obj(path: Path) -> Geometry:
     given = table(path, lambda: rows["vn"])
     if given.size and given.shape[1] != 3:
         raise ValueError(f"{path}: a normal (vn) has {given.shape[1]} numbers; expected 3")
-    counts, corners, named = _obj_faces(path, rows["f"], len(vertices), len(given))
+    counts, corners, named = _obj_faces(path, faces)
     normals = None
     if (
         len(given)
@@ -139,23 +148,43 @@ def read_obj(path: Path) -> Geometry:
         np.add.at(normals, corners, given[named])
     elif len(given) == len(vertices):
         normals = given
-    return Geometry(vertices, fan(counts, corners), normals, colors)
+    return Geometry(vertices, triangulate(vertices, counts, corners), normals, colors)
 
 
-def _obj_faces(path: Path, lines: list[str], vertices: int, normals: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corners a face, vertex of each corner, normal of each corner (-1: none), counted from 0."""
+def _obj_lines(path: Path) -> Iterator[str]:
+    """Lines with content, without comments; one that ends with a backslash goes on in the next."""
+    held = ""
+    for raw in text_lines(path):
+        line = held + raw.partition("#")[0].rstrip()
+        held = line[:-1] + " " if line.endswith("\\") else ""
+        if not held and line.strip():
+            yield line
+    if held.strip():
+        yield held
+
+
+def _obj_faces(path: Path, faces: list[tuple[str, int, int]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corners a face, vertex of each corner, normal of each corner, counted from 0; -1: none.
+
+    A negative number counts back from the last that was read before the face.
+    """
     counts, corners, named = [], [], []
-    for line in lines:
+    for line, vertices, normals in faces:
         words = line.split()
         counts.append(len(words))
         try:
             for word in words:
                 parts = word.split("/")
                 corner, normal = int(parts[0]), int(parts[2]) if len(parts) > 2 and parts[2] else 0
+                if not -vertices <= corner or not corner:
+                    raise ValueError
                 corners.append(corner - 1 if corner > 0 else vertices + corner)
                 named.append(normal - 1 if normal > 0 else normals + normal if normal else -1)
         except ValueError:
-            raise ValueError(f"{path}: 'f {line[:40]}' is no face; expected corners such as 1/1/1 or 1") from None
+            raise ValueError(
+                f"{path}: 'f {line[:40]}' is no face; expected corners such as 1/1/1 or 1, or -1 for the last vertex "
+                f"of the {vertices} before it"
+            ) from None
     return indices(path, counts), indices(path, corners), indices(path, named)
 
 
@@ -197,7 +226,7 @@ def read_off(path: Path) -> Geometry:
                 raise ValueError
         except ValueError:
             raise ValueError(f"{path}: '{line[:40]}' is no face; expected a count and as many corners") from None
-    faces = fan(indices(path, counts), indices(path, corners))
+    faces = triangulate(values[:, :3], indices(path, counts), indices(path, corners))
     return Geometry(values[:, :3], faces, values[:, 3:6] if "N" in head else None, colors)
 
 

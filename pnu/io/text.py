@@ -77,13 +77,3 @@ def indices(path: Path, values: list[int]) -> np.ndarray:
         return np.array(values, np.int64)
     except OverflowError:
         raise ValueError(f"{path}: a face has a corner beyond 2^63; the file is damaged, save it again") from None
-
-
-def fan(counts: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Triangles (f, 3) of polygons given as counts (p,) and their corners in a row; each is cut as a fan."""
-    starts = np.cumsum(counts) - counts
-    triangles = np.maximum(counts - 2, 0)
-    polygon = np.repeat(np.arange(len(counts)), triangles)
-    step = np.arange(triangles.sum()) - np.repeat(np.cumsum(triangles) - triangles, triangles)
-    first = starts[polygon]
-    return np.stack([corners[first], corners[first + step + 1], corners[first + step + 2]], axis=1).astype(np.int64)
