@@ -75,6 +75,32 @@ def test_truth_is_brought_to_its_unit_sphere(box: Mesh) -> None:
     assert evaluation.truth_of_mesh("heat_sink", box, 4000, seed=0).frame == "as given, a unit sphere"
 
 
+def test_a_small_shape_beside_the_origin_is_in_no_unit_sphere(box: Mesh) -> None:
+    """Its farthest vertex is at 1 as well: taken as it is, CD would be 100 times too small."""
+    aside = box.vertices * 0.1 + [0.9, 0, 0]
+    aside /= np.linalg.norm(aside, axis=1).max()
+    made = evaluation.truth_of_mesh("aside", Mesh(aside, box.faces), 2000, seed=0, warn=silent)
+    assert made.frame == "unit sphere of the truth"
+    assert made.mesh is not None
+    assert np.linalg.norm(made.mesh.vertices, axis=1).max() == pytest.approx(1)
+    # the same of samples alone, where each usual center counts
+    even = sample_poisson_disk(box, 2000, np.random.default_rng(0))[:, :3]
+    even /= np.linalg.norm(even, axis=1).max()
+    for cloud, name in ((even, "as given, a unit sphere"), (0.5 * even + [0.5, 0, 0], "unit sphere of the truth")):
+        frame, found = cases.frame_of(cloud / np.linalg.norm(cloud, axis=1).max(), None)
+        assert found == name
+        assert cases.radius(cases.moved(cloud / np.linalg.norm(cloud, axis=1).max(), frame)) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("center", ["centroid", "vertices", "box"])
+def test_a_unit_sphere_about_any_usual_center_stays(center: str) -> None:
+    wedge = shapes.make("wedge")
+    v = wedge.vertices
+    c = {"centroid": cases.centroid(wedge), "vertices": v.mean(0), "box": (v.min(0) + v.max(0)) / 2}[center]
+    frame, name = cases.frame_of(np.zeros((1, 3)), Mesh((v - c) / cases.radius(v - c), wedge.faces))
+    assert (name, float(frame.scale)) == ("as given, a unit sphere", 1.0)
+
+
 def test_a_mesh_that_is_not_watertight_warns_and_works(box: Mesh) -> None:
     warnings: list[str] = []
     opened = evaluation.truth_of_mesh("open", Mesh(box.vertices, box.faces[1:]), 500, 0, warn=warnings.append)
@@ -254,7 +280,7 @@ def test_pairs_are_compared_in_the_unit_sphere_of_the_truth(pairs: Path) -> None
 def test_pairs_with_samples_only_have_no_floor_and_no_p2f(pairs: Path, box: Mesh) -> None:
     even = sample_poisson_disk(box, 1000, np.random.default_rng(1))
     np.save(pairs / "truth" / "sink_1000.npy", np.hstack([40 * even[:, :3] + 1e4, even[:, 3:]]))
-    (case,) = evaluation.source({"root": str(pairs)}, truth_points=2000, warn=silent).cases
+    (case,) = evaluation.source({"root": str(pairs)}, truth_points=1000, warn=silent).cases
     assert len(case.truth.samples) == 1000
     (pairs / "truth" / "sink.ply").unlink()
     (case,) = evaluation.source({"root": str(pairs)}).cases
@@ -262,6 +288,61 @@ def test_pairs_with_samples_only_have_no_floor_and_no_p2f(pairs: Path, box: Mesh
     assert [row["method"] for row in rows] == ["input"]
     assert "p2f" not in rows[0]
     assert rows[0]["normal_unsigned_deg"] < 30
+
+
+def save_samples(pairs: Path, box: Mesh, *counts: int) -> None:
+    for count in counts:
+        np.save(
+            pairs / "truth" / f"sink_{count}.npy", 40 * sample_area(box, count, np.random.default_rng(0))[:, :3] + 1e4
+        )
+
+
+def test_of_several_samples_those_asked_for_are_taken(pairs: Path, box: Mesh) -> None:
+    save_samples(pairs, box, 500, 2000, 900)  # by their names, 900 is the last
+    np.save(pairs / "truth" / "sink_more.npy", np.zeros((5, 3)))  # no count
+    for count in (500, 2000, 900):
+        (case,) = evaluation.source({"root": str(pairs)}, truth_points=count, warn=silent).cases
+        assert len(case.truth.samples) == count
+    said: list[str] = []
+    (case,) = evaluation.source({"root": str(pairs)}, truth_points=1000, warn=said.append).cases
+    assert len(case.truth.samples) == 2000
+    name = pairs / "truth" / "sink_2000.npy"
+    assert said == [f"{name}: is compared with, since there is no sink_1000.npy (truth_points=1000)"]
+
+
+def test_what_is_recorded_is_what_was_used(pairs: Path, box: Mesh, tmp_path: Path) -> None:
+    save_samples(pairs, box, 700)
+    arguments = ["method=midpoint", "data=meshes", f"data.root={pairs}", f"output={tmp_path / 'out'}", "quiet=true"]
+    main([*arguments, "truth_points=1500"])
+    found = read_json(tmp_path / "out" / "metrics.json")
+    assert (found["points"], found["truth_points"]) == (500, 700)
+    assert {row["truth_points"] for row in found["rows"]} == {700}
+
+
+def test_pairs_of_which_it_is_unclear_what_is_meant_are_refused(pairs: Path, box: Mesh) -> None:
+    def refused(text: str) -> None:
+        with pytest.raises(ValueError, match=text):
+            list(evaluation.source({"root": str(pairs)}, truth_points=500).cases)
+
+    np.save(pairs / "truth" / "sink_500.npy", sample_area(box, 499, np.random.default_rng(0))[:, :3])
+    refused("sink_500.npy: holds 499 points, its name says another number; rename it")
+    np.save(pairs / "truth" / "sink_500.npy", sample_area(box, 500, np.random.default_rng(0))[:, :3])
+    refused(r"sink.ply: is not in the frame of .*sink_500.npy")
+    (pairs / "truth" / "sink_500.npy").unlink()
+    write_mesh(pairs / "truth" / "sink.off", box)
+    refused(r"sink.off and .*sink.ply: expected one true mesh of sink")
+    (pairs / "truth" / "sink.off").unlink()
+    write_cloud(pairs / "clouds" / "sink.ply", box.vertices)
+    refused(r"sink.ply and .*sink.xyz: are both named sink")
+
+
+def test_vertices_without_a_face_decide_no_frame(pairs: Path, box: Mesh) -> None:
+    """One of them far away made the allowance so large that any cloud was in the frame."""
+    mesh = Mesh(np.vstack([box.vertices, [[1e4, 0, 0]]]), box.faces)
+    write_mesh(pairs / "truth" / "sink.ply", mesh)
+    write_cloud(pairs / "clouds" / "sink.xyz", sample_area(box, 500, np.random.default_rng(0))[:, :3] + 40)
+    with pytest.raises(ValueError, match="is not in the frame of"):
+        list(evaluation.source({"root": str(pairs)}, truth_points=500, warn=silent).cases)
 
 
 def test_pairs_in_different_frames_are_refused(pairs: Path, box: Mesh) -> None:

@@ -1,5 +1,6 @@
 """What is evaluated: true surfaces, and input clouds drawn from them or read beside them."""
 
+import itertools
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -20,7 +21,8 @@ KINDS = ("uniform", "random", "nonuniform", "sparse", "noise_0.5", "noise_1")
 quarter of the points, evenly spread with Gaussian noise of 0.5 % and 1 % of the radius in each coordinate."""
 
 STRENGTH, CENTERS, CANDIDATES = 2.0, 3, 4  # nonuniform: e^2 times denser, around 3 points, out of 4 times as many
-UNIT = 0.01  # a truth whose radius about the origin differs from 1 by less is taken as it is
+UNIT = 0.01  # how far a unit sphere's radius may be from 1, and its usual centers from the origin
+NEARLY = 0.05  # how far the radius about the centroid may be from 1 where no usual center is the origin
 
 Warn = Callable[[str], None]
 
@@ -102,7 +104,11 @@ def pair_cases(
     """Prepared pairs of a folder: clouds/NAME.xyz (or ply ...) and truth/NAME.ply, the true mesh in the same frame.
 
     truth/NAME_<count>.npy, where there is one, holds the evenly spread points of the truth, (count, 3 or 6); without a
-    mesh it is the truth. Both are brought to the truth's unit sphere if they are not in one.
+    mesh it is the truth. Of several, that of `truth_points` is taken, or the largest. Both are brought to the truth's
+    unit sphere if they are not in one.
+
+    Raises:
+        ValueError: cloud, mesh and samples are not in one frame, or two files have the same name.
     """
     for path in pair_files(root):
         if shapes is not None and path.stem not in shapes:
@@ -116,20 +122,44 @@ def pair_cases(
 
 def read_truth(folder: Path, shape: str, count: int, seed: int, warn: Warn) -> tuple[Truth, Frame]:
     meshes = [path for path in files_of(folder, MESH_SUFFIXES) if path.stem == shape]
-    samples = [path for path in files_of(folder, {".npy"}) if path.stem.rpartition("_")[0] == shape]
-    if not meshes and not samples:
+    samples = samples_path(folder, shape, count, warn)
+    if not meshes and samples is None:
         raise ValueError(f"{folder}: expected {shape}.ply, the true mesh of clouds/{shape}, or {shape}_<count>.npy")
+    if len(meshes) > 1:
+        raise ValueError(f"{meshes[0]} and {meshes[1]}: expected one true mesh of {shape}; remove or rename the other")
     mesh = read_mesh(meshes[0]) if meshes else None
     if mesh is not None and (holes := open_edges(mesh)):
         warn(f"{meshes[0]}: is not watertight ({holes} open edges); taken as an open surface")
-    if samples:
-        cloud = read_cloud(samples[-1])
+    if samples is not None:
+        cloud = read_cloud(samples)
+        if len(cloud.points) != named_count(samples):
+            raise ValueError(f"{samples}: holds {len(cloud.points)} points, its name says another number; rename it")
+        if mesh is not None:
+            surfaces.check_frame(cloud.points, mesh, name=str(samples), truth_name=str(meshes[0]))
         even = cloud.points if cloud.normals is None else np.hstack([cloud.points, cloud.normals])
     else:
         assert mesh is not None
         even = sample_poisson_disk(mesh, count, generator(seed, shape, "truth"))
     frame, name = frame_of(even, mesh)
     return Truth(shape, mesh and moved_mesh(mesh, frame), moved(even, frame), name), frame
+
+
+def samples_path(folder: Path, shape: str, count: int, warn: Warn) -> Path | None:
+    """The file of `count` samples of a shape, or of the most where there is none of so many; None without any."""
+    found = {named_count(path): path for path in files_of(folder, {".npy"}) if path.stem.rpartition("_")[0] == shape}
+    found.pop(None, None)
+    if not found:
+        return None
+    chosen = count if count in found else max(n for n in found if n is not None)
+    if chosen != count:
+        warn(f"{found[chosen]}: is compared with, since there is no {shape}_{count}.npy (truth_points={count})")
+    return found[chosen]
+
+
+def named_count(path: Path) -> int | None:
+    """The count in NAME_<count>.npy."""
+    digits = path.stem.rpartition("_")[2]
+    return int(digits) if digits.isdecimal() else None
 
 
 def check_frame(points: np.ndarray, truth: Truth, path: Path) -> None:
@@ -146,6 +176,9 @@ def pair_files(root: str | Path) -> list[Path]:
     clouds = files_of(Path(root) / "clouds", CLOUD_SUFFIXES)
     if not clouds:
         raise ValueError(f"{root}/clouds: expected clouds ({', '.join(sorted(CLOUD_SUFFIXES))}), found none")
+    for one, other in itertools.pairwise(sorted(clouds, key=lambda path: path.stem)):
+        if one.stem == other.stem:  # their rows would be taken for those of one cloud
+            raise ValueError(f"{one} and {other}: are both named {one.stem}; rename or remove one")
     return clouds
 
 
@@ -162,15 +195,24 @@ def generator(seed: int, shape: str, what: str) -> np.random.Generator:
 def frame_of(samples: np.ndarray, mesh: Mesh | None) -> tuple[Frame, str]:
     """The truth's unit sphere: centroid and greatest distance, of the mesh if there is one, else of the samples.
 
-    A truth whose radius about the origin is 1 already stays as it is.
+    A truth that is in a unit sphere already stays as it is: its radius about the origin is 1, and the origin is its
+    center, be it the centroid, the mean of the vertices or the middle of the box. Where it is neither, the radius about
+    the centroid has to be nearly 1 too, since a small shape beside the origin may reach just as far from it.
     """
     points = samples[:, :3] if mesh is None else mesh.vertices[np.unique(mesh.faces)]
-    if abs(np.linalg.norm(points, axis=1).max() - 1) < UNIT:
+    center = points.mean(0) if mesh is None else centroid(mesh)
+    scale = radius(points - center)
+    centers = np.stack([center, points.mean(0), (points.min(0) + points.max(0)) / 2])
+    centered = np.linalg.norm(centers, axis=1).min() < UNIT or abs(scale - 1) < NEARLY
+    if centered and abs(radius(points) - 1) < UNIT:
         center, scale, name = np.zeros(3), 1.0, "as given, a unit sphere"
     else:
-        center = points.mean(0) if mesh is None else centroid(mesh)
-        scale, name = float(np.linalg.norm(points - center, axis=1).max()), "unit sphere of the truth"
+        name = "unit sphere of the truth"
     return Frame(torch.from_numpy(center)[None, None], torch.full((1, 1, 1), scale, dtype=torch.float64)), name
+
+
+def radius(points: np.ndarray) -> float:
+    return float(np.linalg.norm(points, axis=1).max())
 
 
 def centroid(mesh: Mesh) -> np.ndarray:

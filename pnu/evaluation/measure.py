@@ -15,7 +15,8 @@ from pnu.ops.normals import estimate_normals
 from pnu.ops.surface import closest_points, sample_poisson_disk
 
 Row = dict[str, Any]
-"""shape, kind, frame, method, points_in, points_out, and the metrics; lengths in the frame of the truth, not x 1e3."""
+"""shape, kind, frame, truth_points, method, points_in, points_out, and the metrics; lengths in the frame of the truth,
+not x 1e3."""
 
 Upsampler = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
 """points (n, 3), normals (n, 3) or None -> cloud (m, 6)."""
@@ -40,7 +41,8 @@ def evaluate(
     """
     floors: dict[tuple[str, int], Row] = {}
     for case in cases:
-        truth, head = case.truth, {"shape": case.truth.shape, "kind": case.kind, "frame": case.truth.frame}
+        truth = case.truth
+        head = {"shape": truth.shape, "kind": case.kind, "frame": truth.frame, "truth_points": len(truth.samples)}
         wanted = round(ratio * len(case.points))
         for name, upsample in methods.items():
             step(f"{truth.shape}, {case.kind}: {name}")

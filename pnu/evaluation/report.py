@@ -115,8 +115,20 @@ def write_results(folder: str | Path, rows: Sequence[Row], head: Mapping[str, An
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
         writer.writerows(rows)
-    content = {**head, "legend": legend(rows), "rows": list(rows), "summary": summarize(rows)}
+    content = {**head, **counted(rows), "legend": legend(rows), "rows": list(rows), "summary": summarize(rows)}
     write_json(folder / "metrics.json", content)
+
+
+def counted(rows: Iterable[Row]) -> dict[str, Any]:
+    """The numbers of points that were used, whatever was asked for: one, or all of them where they differ."""
+    found: dict[str, Any] = {}
+    for name, values in (
+        ("points", {row["points_in"] for row in rows if row["method"] == "input"}),
+        ("truth_points", {row["truth_points"] for row in rows if "truth_points" in row}),
+    ):
+        if values:
+            found[name] = min(values) if len(values) == 1 else sorted(values)
+    return found
 
 
 def result_folder(path: str | Path, within: str | Path | None = None) -> Path:

@@ -67,9 +67,10 @@ def check_frame(points: NDArray, truth: Mesh, *, name: str = "cloud", truth_name
     surface = sample_area(truth, 20_000, np.random.default_rng(0))[:, :3]  # fine enough for 5 %, and fast anywhere
     off = float(np.median(cKDTree(surface).query(points[:: -(-len(points) // 1000)])[0]))
     if off > ELSEWHERE * radius:
-        centers = [(p.min(0) + p.max(0)) / 2 for p in (points, truth.vertices)]
+        used = truth.vertices[np.unique(truth.faces)]
+        centers = [(p.min(0) + p.max(0)) / 2 for p in (points, used)]
         apart = np.linalg.norm(centers[0] - centers[1])
-        size = np.ptp(points, axis=0).max() / np.ptp(truth.vertices, axis=0).max()
+        size = np.ptp(points, axis=0).max() / np.ptp(used, axis=0).max()
         raise ValueError(
             f"{truth_name}: is not in the frame of {name}, half of whose points lie more than {off / radius:.0%} of "
             f"its radius off (middles {apart:.3g} apart, {size:.3g} times as large); bring both into one frame"
@@ -77,5 +78,6 @@ def check_frame(points: NDArray, truth: Mesh, *, name: str = "cloud", truth_name
 
 
 def box_radius(mesh: Mesh) -> float:
-    center = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
-    return float(np.linalg.norm(mesh.vertices - center, axis=1).max())
+    """Largest distance of a vertex from the middle of the box; vertices without a face are no part of the surface."""
+    used = mesh.vertices[np.unique(mesh.faces)]
+    return float(np.linalg.norm(used - (used.min(0) + used.max(0)) / 2, axis=1).max())
