@@ -4,6 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from pnu.ops import sampling
+
 try:
     from pnu.ops import kernels
 except ImportError as error:  # no Triton, or an old one
@@ -44,6 +46,20 @@ def test_ball_query(radius: float, k: int) -> None:
     for b, i in torch.cartesian_prod(torch.arange(2), torch.arange(20)).tolist():
         found = inside[b, i].nonzero()[:k, 0].tolist()
         assert idx[b, i].tolist() == found + [found[0] if found else 0] * (k - len(found))
+
+
+@pytest.mark.parametrize("skip", [False, True])
+def test_farthest_points_of_a_cloud_with_duplicates(skip: bool) -> None:
+    """Sixteen places of two points each, sixteen more points, and four that lie near the origin: as the CPU says."""
+    places, near = cloud(1, 16)[0] + 2, 0.01 * cloud(1, 4)[0]
+    points = torch.cat([places, near, places, cloud(1, 16)[0]])[None]
+    idx = kernels.farthest_points(points.to(DEVICE), 52, torch.tensor([2]).to(DEVICE), 1e-3 if skip else -1.0).cpu()[0]
+    steps = sampling._farthest_steps(points, 52, torch.tensor([2]), skip)[0]
+    cpu = sampling.farthest_points(points, 52, start=2, skip_near_origin=skip)[0]
+    able = torch.cat([torch.arange(16), torch.arange(20, 52)]) if skip else torch.arange(52)
+    for found in (idx, steps, cpu):
+        assert found[: len(able)].sort().values.tolist() == able.tolist()
+        assert found[len(able) :].tolist() == [0] * (52 - len(able))
 
 
 @pytest.mark.parametrize("skip_sq", [-1.0, 0.1])

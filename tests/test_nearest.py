@@ -1,5 +1,8 @@
 """Neighbour searches against loops, in trees and in chunks."""
 
+from functools import partial
+from types import ModuleType
+
 import numpy as np
 import pytest
 import torch
@@ -16,10 +19,15 @@ def cloud(clouds: int, n: int, *, seed: int, dtype: torch.dtype = torch.float64)
     return torch.rand(clouds, n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
 
 
-@pytest.fixture(params=["tree", "chunks", "tiny chunks"])
+@pytest.fixture(params=["tree", "kernel", "chunks", "tiny chunks"])
 def path(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The tree of the CPU, and the chunks of other devices run on the CPU, whole or a few rows at a time."""
-    if request.param != "tree":
+    """The tree of the CPU, and on the CPU what other devices take: kernels, chunks whole or a few rows at a time."""
+    if request.param == "kernel":
+        kernels = pytest.importorskip("pnu.ops.kernels")
+        monkeypatch.setattr(module, "_knn_tree", partial(module._knn_kernel, kernels))
+        monkeypatch.setattr(module, "_ball_tree", lambda q, t, *rest: kernels.ball_query(*module._single(q, t), *rest))
+        monkeypatch.setattr(module, "CHUNK_ELEMENTS", 60)
+    elif request.param != "tree":
         monkeypatch.setattr(module, "_knn_tree", module._knn_chunks)
         monkeypatch.setattr(module, "_ball_tree", module._ball_chunks)
     if request.param == "tiny chunks":
@@ -65,6 +73,38 @@ def test_duplicates() -> None:
     found = knn(target[:, :1], target, 6)
     assert sorted(found.idx[0, 0].tolist()) == list(range(6))
     assert bool((found.dist_sq == 0).all())
+
+
+@pytest.mark.usefixtures("path")
+def test_map_coordinates_keep_their_digits() -> None:
+    place = torch.tensor([4.1e6, 5.3e6, 120.0], dtype=torch.float64)
+    points = cloud(2, 60, seed=9)
+    here, there = knn(points, points, 3), knn(points + place, points + place, 3)
+    assert torch.equal(there.idx, here.idx)
+    torch.testing.assert_close(there.dist_sq.sqrt(), here.dist_sq.sqrt(), atol=1e-8, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", [*DTYPES, torch.float16])
+def test_every_float_on_a_gpu_takes_the_kernels(dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tensor that only says that it is on a GPU."""
+    calls: list[tuple[object, ...]] = []
+
+    class Elsewhere(Tensor):
+        device = torch.device("cuda")  # type: ignore[assignment]
+
+    class Kernels(ModuleType):
+        def knn(self, query: Tensor, target: Tensor, k: int) -> tuple[Tensor, Tensor]:
+            calls.append((query.dtype, target.dtype, k))
+            found = module._knn_tree(query.as_subclass(Tensor), target.as_subclass(Tensor), k)
+            return found.dist_sq, found.idx
+
+    monkeypatch.setattr("pnu.ops.kernels", Kernels("kernels"))
+    points = cloud(1, 30, seed=3, dtype=dtype)
+    elsewhere = points.as_subclass(Elsewhere)
+    found = knn(elsewhere, elsewhere, 4)
+    assert calls == [(torch.float32, torch.float32, 4)]
+    assert found.dist_sq.dtype == dtype
+    assert torch.equal(found.idx.as_subclass(Tensor), module._knn_tree(points, points, 4).idx)
 
 
 def test_permuted_targets_give_the_same_neighbours() -> None:

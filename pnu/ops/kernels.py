@@ -117,10 +117,12 @@ def _farthest(points, start, idx, n, m, skip_sq, BLOCK: tl.constexpr):
     y = tl.load(points + offsets * 3 + 1, offsets < n, 0.0)
     z = tl.load(points + offsets * 3 + 2, offsets < n, 0.0)
     eligible = (offsets < n) & (x * x + y * y + z * z > skip_sq)
-    distance = tl.where(eligible, float("inf"), -1.0)
+    distance = tl.where(eligible, float("inf"), -2.0)
     last = tl.load(start + cloud)
     tl.store(idx, last)
     for i in range(1, m):
+        # below its duplicates' zero, above what is never chosen: the first of these repeats when all others are taken
+        distance = tl.where(eligible & (offsets == last), -1.0, distance)
         dx = x - tl.load(points + last * 3)
         dy = y - tl.load(points + last * 3 + 1)
         dz = z - tl.load(points + last * 3 + 2)
@@ -135,7 +137,8 @@ FARTHEST_LIMIT = 16384  # points that one program holds in registers
 def farthest_points(points: Tensor, m: int, start: Tensor, skip_sq: float = -1.0) -> Tensor:
     """idx (B, m) int64 by greedy farthest point sampling of points (B, n <= FARTHEST_LIMIT, 3), in one kernel.
 
-    start (B,) int64. Points with |x|^2 <= skip_sq are chosen as the start only.
+    start (B,) int64. All different, duplicates among the points too. Points with |x|^2 <= skip_sq are chosen as the
+    start only; when the others run out the first of them is repeated.
     """
     points = points.float().contiguous()
     batch, n, _ = points.shape

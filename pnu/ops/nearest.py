@@ -36,7 +36,7 @@ def knn(query: Tensor, target: Tensor, k: int) -> Neighbors:
         return _knn_tree(query, target, k)
     kernels = gpu_kernels(query)
     if kernels and k <= KERNEL_K:
-        return Neighbors(*kernels.knn(query, target, k))
+        return _knn_kernel(kernels, query, target, k)
     return _knn_chunks(query, target, k)
 
 
@@ -84,7 +84,7 @@ def ball_query(query: Tensor, target: Tensor, radius: float, k: int) -> Tensor:
         return _ball_tree(query, target, radius, k)
     kernels = gpu_kernels(query)
     if kernels and k <= KERNEL_K:
-        return kernels.ball_query(query, target, radius, k)
+        return kernels.ball_query(*_single(query, target), radius, k)
     return _ball_chunks(query, target, radius, k)
 
 
@@ -100,8 +100,8 @@ def per_cloud(function: Callable[[int], None], clouds: int) -> None:
 
 
 def gpu_kernels(points: Tensor) -> ModuleType | None:
-    """`pnu.ops.kernels` where they can run: float32 on a CUDA device, with triton installed."""
-    if points.device.type != "cuda" or points.dtype != torch.float32:
+    """`pnu.ops.kernels` where they can run: on a CUDA device, with triton installed. They compute in float32."""
+    if points.device.type != "cuda":
         return None
     try:
         from pnu.ops import kernels
@@ -163,6 +163,27 @@ def _ball_tree(query: Tensor, target: Tensor, radius: float, k: int) -> Tensor:
 
     per_cloud(search, clouds)
     return torch.from_numpy(idx)
+
+
+def _single(query: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Both in float32; of float64 about the targets' mean, since map coordinates lose their detail in float32."""
+    if torch.float64 in (query.dtype, target.dtype):
+        center = target.double().mean(1, keepdim=True)
+        query, target = query - center, target - center
+    return query.float(), target.float()
+
+
+def _knn_kernel(kernels: ModuleType, query: Tensor, target: Tensor, k: int) -> Neighbors:
+    """Chosen in float32; the distances of the chosen, and their order, have the digits of the points."""
+    dist_sq, idx = kernels.knn(*_single(query, target), k)
+    if torch.float64 not in (query.dtype, target.dtype):
+        return Neighbors(dist_sq.to(query.dtype), idx)
+    batch = torch.arange(len(idx), device=idx.device)[:, None, None]
+    parts = []
+    for part in torch.arange(query.shape[1], device=idx.device).split(max(1, CHUNK_ELEMENTS // (3 * k * len(idx)))):
+        parts.append((query[:, part, None] - target[batch, idx[:, part]]).square_().sum(-1))
+    dist_sq, order = torch.cat(parts, 1).sort(dim=-1, stable=True)
+    return Neighbors(dist_sq.to(query.dtype), idx.gather(-1, order))
 
 
 def _chunks(query: Tensor, target: Tensor) -> Iterator[tuple[slice, slice]]:

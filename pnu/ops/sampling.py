@@ -186,15 +186,14 @@ def _farthest_steps(points: Tensor, m: int, start: Tensor, skip_near_origin: boo
     clouds, n, _ = points.shape
     row = torch.arange(clouds, device=points.device)
     dist_sq = points.new_full((clouds, n), torch.inf)
-    if skip_near_origin:
-        dist_sq[points.square().sum(-1) <= NEAR_ORIGIN_SQ] = -1
+    eligible = points.square().sum(-1) > (NEAR_ORIGIN_SQ if skip_near_origin else -1)
+    dist_sq[~eligible] = -2
     current = start
     out = torch.empty(clouds, m, dtype=torch.int64, device=points.device)
     for i in range(m):
         out[:, i] = current
         step = (points - points[row, current][:, None]).square_().sum(-1)
         torch.minimum(dist_sq, step, out=dist_sq)
-        if not skip_near_origin:
-            dist_sq[row, current] = -1
+        dist_sq[row, current] = torch.where(eligible[row, current], -1.0, -2.0)
         current = dist_sq.argmax(1)
     return out
