@@ -27,17 +27,22 @@ from pnu import models, weights
 from pnu.io import atomic_path, write_json
 
 PREFIX = "model."
+NEWEST = "newest"  # instead of a run folder
 
 
 def load(source: str | PathLike[str]) -> nn.Module:
     """The trained network of a run folder, of a file of weights, or of that shipped name, on the CPU, in eval mode.
 
+    "newest" is the run that finished last under outputs/. Generators and settings of torch are left alone, and have no
+    influence.
+
     Raises:
         ValueError: no run folder, or its config or checkpoint are not those of a network of ours.
     """
+    source = resolve(source)
     if (file := weights.find(source)) is not None:
         model, points, tensors = weights.read(file)
-        network = models.build(model)
+        network = _unfilled(model)
         if points is not None:
             network.patch_size = points  # type: ignore[assignment]
         fill(network, tensors, file)
@@ -49,7 +54,7 @@ def load(source: str | PathLike[str]) -> nn.Module:
             f" ({', '.join(weights.names())}), found no folder"
         )
     config = run_config(folder)
-    network = models.build(config["model"])
+    network = _unfilled(config["model"])
     points = config["data"].get("input_points") if isinstance(config.get("data"), dict) else None
     if isinstance(points, int):
         network.patch_size = points  # type: ignore[assignment]  # radii are fractions of a patch: what it was trained on
@@ -59,6 +64,21 @@ def load(source: str | PathLike[str]) -> nn.Module:
         raise ValueError(f"{path}: expected a checkpoint with a 'state_dict', found none")
     fill(network, {key.removeprefix(PREFIX): v for key, v in state.items() if key.startswith(PREFIX)}, path)
     return network.eval()
+
+
+def resolve(source: str | PathLike[str]) -> str | PathLike[str]:
+    """The source, or the newest finished run where it is "newest"; ValueError if there is none."""
+    if source != NEWEST:
+        return source
+    if (run := newest_run()) is None:
+        raise ValueError("run=newest: no finished run under outputs/; train one with `make train`, or give run=FOLDER")
+    return run
+
+
+def _unfilled(config: Mapping[str, Any]) -> nn.Module:
+    """The network of a config, to be filled, in float32; what it draws at first leaves no trace in the generator."""
+    with torch.device("cpu"), torch.random.fork_rng(devices=[]):
+        return models.build(config).float()
 
 
 def run_config(folder: Path) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from pnu.run.groups import Data
 from pnu.run.progress import steps
 
 NORMALS = {"given": "as given", "estimate": "estimated"}
+DEFAULT = {"given": "surface", "estimate": "surface_estimated"}  # without run= and method=
 SETTINGS = ("ratio", "points", "truth_points", "normals", "search", "passes", "seed")
 
 
@@ -19,7 +20,7 @@ class Evaluate:
 
     also: ClassVar = {"model": "run"}
     run: str | None = doc(
-        "run folder, or name or file of weights; null: the newest finished run under outputs/, or `method`"
+        "run folder, or name or file of weights; newest: the run that finished last; null: `method`, or surface"
     )
     method: str | None = doc("upsampler without training instead of a run: apss, poisson or midpoint")
     data: Data = doc(
@@ -47,7 +48,7 @@ class Evaluate:
 
 def evaluate(cfg: Any) -> None:
     check(cfg)
-    from pnu import checkpoint, classical, evaluation, inference, io
+    from pnu import checkpoint, classical, evaluation, io
     from pnu.metrics import raycast
     from pnu.ops.surface import closest_points
 
@@ -55,7 +56,7 @@ def evaluate(cfg: Any) -> None:
         cfg.data, cfg.kinds, part=cfg.part, only=cfg.shapes, points=cfg.points, truth_points=cfg.truth_points,
         seed=cfg.seed, normals=cfg.normals == "given", warn=warn,
     )  # fmt: skip
-    subject = cfg.method or str(cfg.run or inference.newest_run())
+    subject = cfg.method or str(checkpoint.resolve(cfg.run or DEFAULT[cfg.normals]))
     model = classical.method(subject) if cfg.method else checkpoint.load(subject)
     upsampler = evaluation.network_upsampler(
         model, cfg.ratio, passes=cfg.passes, name=subject, patch_size=cfg.patch_size, batch_size=cfg.batch_size,

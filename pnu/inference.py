@@ -3,9 +3,10 @@
 import copy
 import hashlib
 import math
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from functools import partial
-from numbers import Integral
+from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
 from typing import Any, Protocol, cast, runtime_checkable
@@ -53,7 +54,7 @@ def upsample(
     normals: np.ndarray | None = None,
     *,
     ratio: float = 4,
-    model: nn.Module | str | PathLike[str] | None = None,
+    model: nn.Module | str | PathLike[str] = "surface",
     patch_size: int | None = None,
     device: str = "auto",
     devices: int = 1,
@@ -71,12 +72,12 @@ def upsample(
     depends neither on the order of the points nor on repeated ones.
 
     Args:
-        points: (n, 3), or (n, 6) with normals, n >= 16, in any unit and anywhere.
+        points: (n, 3), or (n, 6) with normals, n >= 16, in any unit and anywhere; an array, or a tensor on any device.
         normals: (n, 3), of any length but zero; estimated and oriented where missing here and in points.
         ratio: points out for each point in, any number >= 1.
-        model: network, run folder, file of weights, or the name of weights that come with pnu (`pnu.weights`):
-            "surface" takes those made for estimated normals where none are given. None: the newest finished run under
-            outputs/, or "surface" where there is none.
+        model: network, run folder, file of weights, the name of weights that come with pnu (`pnu.weights`), or
+            "newest", the run that finished last under outputs/. "surface" takes the weights made for estimated normals
+            where none are given.
         patch_size: points of a patch, at least 16; None: what the network was made for. "surface" has no patches.
         device: "auto" (where the given network is; else CUDA where there is one), "cpu", "cuda", "cuda:1" ...
         devices: CUDA devices, or processes on the CPU, that share the work of the network; the result is the same for
@@ -92,11 +93,18 @@ def upsample(
 
     Raises:
         ValueError: in one line, which argument is wrong and what was expected.
+
+    The network comes back as it was, modes and device too; generators and settings of torch are left alone.
     """
     progress = progress or (lambda stage, done, total: None)
     given = _given(points, normals)
     count = output_count(len(given.points), ratio)
-    sizes = (("patch_size", patch_size, MINIMUM), ("batch_size", batch_size, 1), ("devices", devices, 1))
+    sizes = (
+        ("patch_size", patch_size, MINIMUM),
+        ("batch_size", batch_size, 1),
+        ("devices", devices, 1),
+        ("seed", seed, 0),
+    )
     for name, value, least in sizes:
         if value is not None and not (isinstance(value, Integral) and value >= least):
             raise ValueError(f"{name}={value}: expected a whole number >= {least}")
@@ -111,19 +119,16 @@ def upsample(
     if devices > 1 and not in_parts:
         raise ValueError(f"devices={devices}: {type(network).__name__} works in one process; leave devices=1")
     names = _names(target, devices)
-    training = network.training
-    network.eval()
-    try:
-        with torch.no_grad(), ExitStack() as stack:
-            if devices > 1:
-                make = partial(_begin, copy.deepcopy(network).cpu(), patch_size, batch_size)
-                options["workers"] = stack.enter_context(Processes(make, names))
-            raw = upsampler.upsample_cloud(
-                sparse.to(target), count, batch_size=batch_size, generator=generator, progress=progress, **options
-            )
-            dense = with_unit_normals(raw.cpu().double(), sparse)
-    finally:
-        network.train(training)
+    with torch.no_grad(), evaluating(network), ExitStack() as stack:
+        if torch.get_default_device().type != "cpu":
+            stack.enter_context(torch.device("cpu"))
+        if devices > 1:
+            make = partial(_begin, copy.deepcopy(network).cpu(), patch_size, batch_size)
+            options["workers"] = stack.enter_context(Processes(make, names))
+        raw = upsampler.upsample_cloud(
+            sparse.to(target), count, batch_size=batch_size, generator=generator, progress=progress, **options
+        )
+        dense = with_unit_normals(raw.cpu().double(), sparse)
     return frame.from_unit(dense[None])[0].numpy()
 
 
@@ -141,46 +146,66 @@ def attributes(dense: np.ndarray, cloud: Cloud) -> dict[str, np.ndarray]:
 
 def output_count(n: int, ratio: float) -> int:
     """round(ratio n), or `ValueError` for a ratio that is no number >= 1 or asks for more than 1e9 points."""
-    if not 1 <= ratio < float("inf"):
-        raise ValueError(f"ratio={ratio:g}: expected a number >= 1, the points out for each point in")
+    if not (isinstance(ratio, Real) and 1 <= ratio < float("inf")):
+        raise ValueError(f"ratio={_short(ratio)}: expected a number >= 1, the points out for each point in")
     count = round(ratio * n)
     if count > LARGEST:
         raise ValueError(f"ratio={ratio:g}: asks for {count} points, at most {LARGEST:g} are made; lower it")
     return count
 
 
-def source(model: str | PathLike[str] | None, normals: np.ndarray | None) -> str | PathLike[str]:
-    """What `checkpoint.load` takes, for a cloud with these normals."""
-    model = model or checkpoint.newest_run() or "surface"
-    return "surface_estimated" if model == "surface" and normals is None else model
-
-
-def newest_run() -> Path:
-    """The run that finished last under outputs/; `ValueError` if there is none."""
-    run = checkpoint.newest_run()
-    if run is None:
-        raise ValueError("run: no finished run under outputs/; train one with `make train`, or give run=FOLDER")
-    return run
+def source(model: str | PathLike[str], normals: np.ndarray | None) -> str | PathLike[str]:
+    """What `checkpoint.load` takes, for a cloud with these normals: "surface" means one of two, "newest" a run."""
+    if model == "surface" and normals is None:
+        return "surface_estimated"
+    return checkpoint.resolve(model)
 
 
 def _given(points: np.ndarray, normals: np.ndarray | None) -> Cloud:
     """The cloud that points (n, 3) or (n, 6) and normals (n, 3) describe, checked."""
     expected = "points: expected an array (n, 3), or (n, 6) with normals"
-    try:
-        array = np.asarray(points, np.float64)
-    except ValueError:
-        raise ValueError(f"{expected}, found {type(points).__name__}") from None
+    array = _array(points, expected)
     if array.ndim != 2 or array.shape[1] not in (3, 6):
         raise ValueError(f"{expected}, found shape {array.shape}")
     if array.shape[1] == 6:
         if normals is not None:
             raise ValueError("normals: are in points (n, 6) already; give points (n, 3), or no normals beside them")
         array, normals = array[:, :3], array[:, 3:]
+    elif normals is not None:
+        normals = _array(normals, f"normals: expected an array {array.shape}")
     return check_cloud(Cloud(array, normals, {}), "points", minimum=MINIMUM)
 
 
+def _array(values: Any, expected: str) -> np.ndarray:
+    """An array or a tensor, wherever it lies and whether or not it has a gradient, as float64."""
+    try:
+        if isinstance(values, Tensor):
+            values = values.detach().cpu().double().resolve_conj().resolve_neg().numpy()
+        if np.iscomplexobj(values):
+            raise ValueError("complex")
+        return np.asarray(values, np.float64)
+    except (ValueError, TypeError, RuntimeError, OverflowError):
+        raise ValueError(f"{expected}, found {type(values).__name__}") from None
+
+
+def _short(value: object) -> str:
+    return f"{value:g}" if isinstance(value, Real) else repr(value)[:40]
+
+
+@contextmanager
+def evaluating(network: nn.Module) -> Iterator[None]:
+    """A network in eval mode, each of its modules in its own mode again in the end."""
+    training = [module for module in network.modules() if module.training]
+    network.eval()
+    try:
+        yield
+    finally:
+        for module in training:
+            module.training = True
+
+
 def _on_device(model: nn.Module | str | PathLike[str], device: str) -> tuple[nn.Module, torch.device]:
-    """The network, and the device it now lies on."""
+    """The network on a device, and which; one that is given and lies elsewhere is copied, not moved."""
     given = isinstance(model, nn.Module)
     network = model if isinstance(model, nn.Module) else checkpoint.load(model)
     if device != "auto":
@@ -193,6 +218,8 @@ def _on_device(model: nn.Module | str | PathLike[str], device: str) -> tuple[nn.
         target = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
     else:
         target = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if given and any(tensor.device != target for tensor in (*network.parameters(), *network.buffers())):
+        network = copy.deepcopy(network)
     return network.to(target), target
 
 
@@ -264,7 +291,13 @@ class Patchwise:
 
     def __init__(self, network: nn.Module, patch_size: int | None = None) -> None:
         self.network = network
-        self.ratio = int(cast(int, network.ratio))
+        ratio = getattr(network, "ratio", None)
+        if not (isinstance(ratio, Integral) and int(ratio) >= 1):
+            raise ValueError(
+                "model: expected a network with an attribute `ratio`, the points out for each point in, a whole number "
+                f">= 1; found {_short(ratio)}"
+            )
+        self.ratio = int(ratio)
         self.patch_size = patch_size or int(getattr(network, "patch_size", 1024))
         self.like = next(network.parameters(), torch.empty(0))  # tells device and type
 
@@ -290,6 +323,11 @@ class Patchwise:
 
     def pass_sizes(self, n: int, count: int) -> list[int]:
         """Number of points after each pass from n to count: as few passes as possible, all with the same growth."""
+        if self.ratio == 1 and count > n:
+            raise ValueError(
+                f"model: a network of ratio 1 makes no more points than it gets, {count} of {n} were asked for; leave "
+                "ratio=1, or take a network of ratio 2 or more"
+            )
         reach = self.ratio * (SLACK if n > self.patch_size else 1)
         passes = 1
         while count > n * reach**passes:

@@ -25,9 +25,7 @@ class Upsample:
     also: ClassVar = {"model": "run"}
     input: str = doc("file to read: ply, xyz, txt, pcd, obj, off, npy, las or laz")
     output: str = doc("file to write; its suffix says the format")
-    run: str | None = doc(
-        "run folder, or weights that come with pnu: surface, pnu ...; null: the newest run, or surface"
-    )
+    run: str = doc("run folder, or weights that come with pnu: surface, pnu ...; newest: the run that finished last")
     ratio: float = doc("points out for each point in, any number >= 1")
     normals: str = doc("auto: the file's, estimated where it has none; estimate: always estimated")
     patch_size: int | None = doc("points of a patch, at least 16; null: what the network was made for")
@@ -54,12 +52,15 @@ def upsample(cfg: Any) -> None:
     origin = "with normals" if cloud.normals is not None else "normals estimated and oriented"
     say(f"input:  {cfg.input}, {len(cloud.points)} points, {origin}")
 
-    from pnu import inference
+    from pnu import inference, weights
+    from pnu.checkpoint import NEWEST
     from pnu.ops.survey import survey
 
     say(f"        {survey(cloud.points, cloud.normals)}")
     run = inference.source(cfg.run, cloud.normals)
-    chosen = "" if cfg.run else " (the newest finished one)" if Path(run).is_dir() else " (comes with pnu)"
+    chosen = (
+        " (the newest finished one)" if cfg.run == NEWEST else " (comes with pnu)" if run in weights.names() else ""
+    )
     say(f"run:    {run}{chosen}")
     # a long one goes on, after an interruption, from the parts that are done
     parts = Path(f"{cfg.output}.parts") if cfg.ratio * len(cloud.points) >= LONG else None

@@ -224,6 +224,37 @@ def test_progress_reaches_the_end_of_each_stage() -> None:
         assert (done[0], done[-1]) == (0, steps[-1][1])
 
 
+def test_a_network_that_adds_no_points() -> None:
+    points = sphere(600)
+    assert upsample(points, points, model=Spread(1), ratio=1).shape == (600, 6)
+    for size in (256, 1024):  # of patches: several, or one
+        with pytest.raises(
+            ValueError, match="^model: a network of ratio 1 makes no more points than it gets, 1200 of "
+        ):
+            upsample(points, points, model=Spread(1, patch_size=size), ratio=2)
+
+
+@pytest.mark.parametrize("ratio", [0, -2, 2.5, None, "4"])
+def test_a_network_without_a_ratio(ratio: object) -> None:
+    network = Spread()
+    network.ratio = ratio  # type: ignore[assignment]
+    with pytest.raises(
+        ValueError, match="^model: expected a network with an attribute `ratio`, .* a whole number >= 1"
+    ):
+        upsample(sphere(100), sphere(100), model=network)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16])
+def test_tensors_as_points(dtype: torch.dtype) -> None:
+    points = torch.from_numpy(sphere(100)).to(dtype).requires_grad_()
+    expected = upsample(points.detach().double().numpy(), points.detach().double().numpy(), model=Spread())
+    np.testing.assert_array_equal(upsample(points, points, model=Spread()), expected)  # type: ignore[arg-type]
+    both = torch.cat([points, points], 1)
+    assert both.grad_fn is not None
+    np.testing.assert_array_equal(upsample(both, model=Spread()), expected)  # type: ignore[arg-type]
+    assert points.grad is None
+
+
 class Whole(nn.Module):
     """A model with a procedure of its own for whole clouds."""
 
@@ -259,6 +290,15 @@ BAD = {
     "shape": ({"points": np.zeros((20, 5))}, r"^points: expected an array \(n, 3\), or .*, found shape \(20, 5\)$"),
     "type": ({"points": "scan.ply"}, r"^points: expected an array \(n, 3\), or \(n, 6\) with normals, found str$"),
     "equal": ({"points": np.ones((20, 3))}, "^points: all 20 points are equal"),
+    "ratio text": ({"ratio": "4"}, "^ratio='4': expected a number >= 1"),
+    "complex": ({"points": 1j * GOOD}, r"^points: expected an array \(n, 3\), or .*, found ndarray$"),
+    "objects": ({"points": [object()] * 20}, r"^points: expected an array \(n, 3\), or .*, found list$"),
+    "ragged": ({"points": [[1, 2], [3]]}, r"^points: expected an array \(n, 3\), or .*, found list$"),
+    "meta": ({"points": torch.zeros(20, 3, device="meta")}, r"^points: expected an array .*, found Tensor$"),
+    "sparse": ({"points": torch.eye(20)[:, :3].to_sparse()}, r"^points: expected an array .*, found Tensor$"),
+    "normals text": ({"normals": "up"}, r"^normals: expected an array \(20, 3\), found str$"),
+    "no newest": ({"model": "newest"}, "^run=newest: no finished run under outputs/"),
+    "seed": ({"seed": -1}, "^seed=-1: expected a whole number >= 0"),
     "nan": ({"points": np.where(ZERO == 0, np.nan, GOOD)}, "^points: 1 of 20 points hold NaN"),
     "zero normal": ({"normals": ZERO}, r"^points: 1 of 20 normals have length zero \(the first: number 4\)"),
     "normals twice": ({"points": np.hstack([GOOD, GOOD]), "normals": GOOD}, "^normals: are in points"),
@@ -273,7 +313,8 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_arguments(case: str) -> None:
+def test_bad_arguments(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     changes, message = BAD[case]
     with pytest.raises(ValueError, match=message) as error:
         upsample(**{"points": GOOD, "model": Spread(), **changes})

@@ -45,7 +45,7 @@ def upsample(place: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 def test_newest_run_and_report(place: Path) -> None:
     make_run(place / "outputs" / "2026-01-02" / "04-00-00_dead", status="failed")
-    done = upsample(place, "input=cloud.ply", "output=dense.xyz", "ratio=3.5")
+    done = upsample(place, "input=cloud.ply", "output=dense.xyz", "ratio=3.5", "run=newest")
     assert done.returncode == 0, done.stderr
     dense = read_cloud(place / "dense.xyz")
     assert dense.points.shape == (700, 3)
@@ -77,15 +77,6 @@ def test_given_run_quiet_and_estimated_normals(place: Path) -> None:
     assert "carried over: colors" in done.stdout
     assert (read_cloud(place / "c.pcd").attributes["colors"] == 0).all()
     assert len(read_cloud(place / "c.pcd").points) == 200
-
-
-def test_weights_by_name(place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    from pnu.upsample import main
-
-    monkeypatch.chdir(place)
-    main([*GOOD, "model=surface"])  # not the run in outputs/
-    assert "run:    surface\n" in capsys.readouterr().out
-    assert len(read_cloud(place / "dense.ply").points) == 800
 
 
 GOOD = ("input=cloud.ply", "output=dense.ply")
@@ -135,6 +126,16 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     assert before == {path: path.stat().st_mtime_ns for path in place.rglob("*") if path.is_file()}
 
 
+def test_no_newest_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    from pnu.upsample import main
+
+    monkeypatch.chdir(tmp_path)
+    np.save("cloud.npy", np.random.default_rng(0).normal(size=(100, 3)))
+    with pytest.raises(SystemExit):
+        main(["input=cloud.npy", "output=dense.ply", "run=newest"])
+    assert capsys.readouterr().err.startswith("error: run=newest: no finished run under outputs/; train one with")
+
+
 def test_bad_input_of_the_real_command(place: Path) -> None:
     done = upsample(place, *GOOD, "ratio=0.5")
     assert (done.returncode, done.stdout) == (2, "")
@@ -148,13 +149,30 @@ def test_no_bar_before_an_error(place: Path) -> None:
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_no_run_at_all(tmp_path: Path) -> None:
-    """Weights that come with pnu take over, and the command says so."""
-    points = np.random.default_rng(0).normal(size=(100, 3))
-    write_cloud(tmp_path / "cloud.ply", points / np.linalg.norm(points, axis=1, keepdims=True))
-    done = upsample(tmp_path, *GOOD)
-    assert done.returncode == 0, done.stderr
-    assert "run:    surface_estimated (comes with pnu)" in done.stdout
+@pytest.mark.parametrize("run", [[], ["model=surface"]])
+def test_the_default_is_what_comes_with_pnu(
+    place: Path, run: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever was trained in this folder, from the command line and from Python."""
+    import pnu
+    from pnu.upsample import main
+
+    monkeypatch.chdir(place)
+    points, normals, _ = read_cloud(place / "cloud.ply")
+    np.save(place / "points.npy", points)
+    main(["input=cloud.ply", "output=a.npy", *run])
+    main(["input=points.npy", "output=b.npy", *run])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if line.startswith("run:")] == [
+        "run:    surface (comes with pnu)",
+        "run:    surface_estimated (comes with pnu)",
+    ]
+    np.testing.assert_array_equal(np.load("a.npy"), pnu.upsample(points, normals))
+    np.testing.assert_array_equal(np.load("a.npy"), pnu.upsample(points, normals, model="surface"))
+    np.testing.assert_array_equal(np.load("b.npy"), pnu.upsample(points))
+    newest = pnu.upsample(points, normals, model="newest")
+    np.testing.assert_array_equal(newest, pnu.upsample(points, normals, model="outputs/2026-01-02/03-04-05_small"))
+    assert not np.array_equal(newest, np.load("a.npy"))
 
 
 def test_help_names_every_key(tmp_path: Path) -> None:
