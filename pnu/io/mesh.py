@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pnu.io.atomic import atomic_path
-from pnu.io.fields import as_colors
+from pnu.io.fields import NORMAL, XYZ, arranged, as_colors
 from pnu.io.ply import Lists, read_ply, write_ply
 from pnu.io.polygons import triangulate
 from pnu.io.text import indices, known_suffix, open_file, table, text_lines
@@ -89,32 +89,33 @@ def write_mesh(
             writer(temporary, Geometry(vertices, faces, vertex_normals, colors))
 
 
-def single_if_exact(values: np.ndarray) -> np.ndarray:
-    """As float32 where that changes nothing, else float64: georeferenced coordinates need the digits."""
-    with np.errstate(over="ignore"):
-        single = values.astype(np.float32)
-    return single if np.array_equal(single, values) else values.astype(np.float64)
+def single_if_enough(points: np.ndarray) -> np.ndarray:
+    """As float32, which every program reads, where that is good to a millionth of the extent; else float64."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        single = points.astype(np.float32)
+        moved = np.abs(single - points).max(initial=0)
+    return single if moved <= 1e-6 * np.ptp(points, axis=0).max(initial=0) else points.astype(np.float64)
 
 
 def xyz_columns(points: np.ndarray) -> dict[str, np.ndarray]:
-    return dict(zip("xyz", single_if_exact(points).T, strict=True))
+    return dict(zip(XYZ, single_if_enough(points).T, strict=True))
 
 
 def ply_normals(normals: np.ndarray | None) -> dict[str, np.ndarray]:
-    return {} if normals is None else dict(zip(("nx", "ny", "nz"), np.asarray(normals, np.float32).T, strict=True))
+    return {} if normals is None else dict(zip(NORMAL, np.asarray(normals, np.float32).T, strict=True))
 
 
 def _read_ply(path: Path) -> Geometry:
     elements = read_ply(path, {"vertex", "face"})
-    vertex, face = elements.get("vertex", {}), elements.get("face", {})
-    if any(not isinstance(vertex.get(axis), np.ndarray) for axis in "xyz"):
+    vertex = arranged({name: v for name, v in elements.get("vertex", {}).items() if isinstance(v, np.ndarray)})
+    if vertex.points is None:
         raise ValueError(f"{path}: expected a vertex element with properties x y z; save the file again")
-    corners = face.get("vertex_indices", face.get("vertex_index"))
-    vertices = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    vertices = vertex.points.astype(np.float64)
     faces = np.empty((0, 3), np.int64)
-    if isinstance(corners, Lists):
-        faces = triangulate(vertices, corners.counts, corners.values.astype(np.int64))
-    return Geometry(vertices, faces)
+    for name, corners in elements.get("face", {}).items():
+        if name.lower() in ("vertex_indices", "vertex_index") and isinstance(corners, Lists):
+            faces = triangulate(vertices, corners.counts, corners.values.astype(np.int64))
+    return Geometry(vertices, faces, vertex.normals, vertex.colors)
 
 
 def read_obj(path: Path) -> Geometry:

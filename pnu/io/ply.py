@@ -14,7 +14,7 @@ from pnu.io.text import table
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"},
-    **{"double": "f8", "float64": "f8", "int64": "i8", "uint64": "u8"},
+    **{"double": "f8", "float64": "f8", "int64": "i8", "uint64": "u8", "bool": "u1"},
 }
 SLICE = 2**20  # rows written at once
 NAMES = {
@@ -48,24 +48,44 @@ Columns = dict[str, np.ndarray | Lists]
 
 
 def read_ply(path: Path, wanted: set[str]) -> dict[str, Columns]:
-    """Columns of the wanted elements by property name. Counts that the file's size cannot hold are refused unread."""
-    with path.open("rb") as handle:
-        data = mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ)  # pages come in as they are needed
+    """Columns of the wanted elements by property name.
+
+    Counts that the file's size cannot hold are refused unread, and so are files that go on after the last element.
+    """
+    data = _mapped(path)
     order, elements, start = _header(path, data)
     found: dict[str, Columns] = {}
     if order is None:
         lines = iter(data[start:].decode("ascii", "replace").splitlines())
         rows = (line for line in lines if line.strip())
     for element in elements:
-        if not wanted - found.keys():
-            break
         if order is None:
-            columns = _text(path, element, list(islice(rows, min(element.size, len(data)))))
+            own = list(islice(rows, min(element.size, len(data)) if element.properties else 0))
+            if element.name in wanted:
+                found[element.name] = _text(path, element, own)
+            elif len(own) < element.size and element.properties:
+                raise _short(path, element, str(len(own)))
+        elif element.name in wanted:
+            found[element.name], start = _binary(path, data, start, element, order)
         else:
-            columns, start = _binary(path, data, start, element, order)
-        if element.name in wanted:
-            found[element.name] = columns
+            start = _skip(path, data, start, element, order)
+    if order is None:
+        if more := sum(1 for _ in rows):
+            raise _long(path, elements, more, "lines")
+    elif data[start : start + SLICE].strip(b"\0\r\n\t \x1a"):  # some programs fill up the last block
+        raise _long(path, elements, len(data) - start, "bytes")
     return found
+
+
+def element_sizes(path: Path) -> dict[str, int]:
+    """How many of each element the header promises."""
+    return {element.name: element.size for element in _header(path, _mapped(path))[1]}
+
+
+def _mapped(path: Path) -> mmap.mmap:
+    """The file's bytes: pages come in as they are needed."""
+    with path.open("rb") as handle:
+        return mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ)
 
 
 def _header(path: Path, data: mmap.mmap) -> tuple[str | None, list[Element], int]:
@@ -87,10 +107,10 @@ def _header(path: Path, data: mmap.mmap) -> tuple[str | None, list[Element], int
                     elements[-1].properties.append(Property(name, TYPES[kind], TYPES[length]))
                 case ["property", kind, name] if kind != "list":
                     elements[-1].properties.append(Property(name, TYPES[kind], ""))
-                case [] | ["comment" | "obj_info", *_]:
-                    pass
-                case _:
+                case ["format" | "element" | "property", *_]:
                     raise ValueError(line)
+                case _:
+                    pass  # comment, obj_info, and what exporters write without either
         except (ValueError, KeyError, IndexError):
             raise ValueError(f"{path}: '{line.strip()[:60]}' is no line of a ply header; save the file again") from None
     if order == "":
@@ -107,6 +127,21 @@ def _short(path: Path, element: Element, found: str) -> ValueError:
     return ValueError(
         f"{path}: the header promises {element.size} of element '{element.name}', the file holds {found}; "
         "it is cut off or damaged, copy it again"
+    )
+
+
+def _long(path: Path, elements: list[Element], more: int, unit: str) -> ValueError:
+    """For a file that goes on after the last element: which line of the header would be right, where that is clear."""
+    element = next((element for element in reversed(elements) if element.size), Element("vertex", 0, []))
+    fixed = not any(item.length for item in element.properties)
+    row = 1 if unit == "lines" else sum(np.dtype(item.type).itemsize for item in element.properties)
+    cure = "save it again"
+    if element.size and fixed and row and more % row == 0:
+        line = f"element {element.name} {{}}"
+        whole = element.size + more // row
+        cure = f"if all belong to it, write '{line.format(whole)}' for '{line.format(element.size)}' in its header"
+    return ValueError(
+        f"{path}: goes on after the last element, with {more} {unit} more than the header promises; {cure}"
     )
 
 
@@ -149,11 +184,51 @@ def _text(path: Path, element: Element, lines: list[str]) -> Columns:
 
 def _binary(path: Path, data: mmap.mmap, start: int, element: Element, order: str) -> tuple[Columns, int]:
     """Columns of an element that begins at byte `start`, and where it ends."""
+    if not _fits(path, data, start, element):
+        return {item.name: np.empty(0, item.type) for item in element.properties}, start
+    lengths, rows = _uniform(path, data, start, element, order)
+    if rows is not None:
+        return _columns(element, rows, lengths), start + rows.nbytes
+    return _ragged(path, data, start, element, order)
+
+
+def _skip(path: Path, data: mmap.mmap, start: int, element: Element, order: str) -> int:
+    """Where an element ends that begins at byte `start`."""
+    if not _fits(path, data, start, element):
+        return start
+    _, rows = _uniform(path, data, start, element, order)
+    if rows is not None:
+        return start + rows.nbytes
+    kinds = [
+        (struct.Struct(order + np.dtype(item.length).char) if item.length else None, np.dtype(item.type).itemsize)
+        for item in element.properties
+    ]
+    try:
+        for number in range(element.size):  # noqa: B007
+            for length, size in kinds:
+                if length is None:
+                    start += size
+                else:
+                    start += length.size + size * max(length.unpack_from(data, start)[0], 0)
+    except struct.error:
+        raise _short(path, element, str(number)) from None
+    if start > len(data):
+        raise _short(path, element, str(number))
+    return start
+
+
+def _fits(path: Path, data: mmap.mmap, start: int, element: Element) -> bool:
+    """False for an element without content; `ValueError` for more rows than there are bytes."""
     least = sum(np.dtype(item.length or item.type).itemsize for item in element.properties)
     if element.size * least > len(data) - start:
         raise _short(path, element, f"{len(data) - start} bytes more")
-    if element.size == 0 or least == 0:
-        return {item.name: np.empty(0, item.type) for item in element.properties}, start
+    return element.size > 0 and least > 0
+
+
+def _uniform(
+    path: Path, data: mmap.mmap, start: int, element: Element, order: str
+) -> tuple[dict[str, int], np.ndarray | None]:
+    """Lengths of the lists in the first row; and the rows, None where those of others are not the same."""
     try:
         lengths, _ = _row_lengths(data, start, element, order)
     except struct.error:
@@ -162,8 +237,8 @@ def _binary(path: Path, data: mmap.mmap, start: int, element: Element, order: st
     if element.size * dtype.itemsize <= len(data) - start:
         rows = np.frombuffer(data, dtype, element.size, start)
         if all(np.all(rows[f"{name} count"] == length) for name, length in lengths.items()):
-            return _columns(element, rows, lengths), start + rows.nbytes
-    return _ragged(path, data, start, element, order)
+            return lengths, rows
+    return lengths, None
 
 
 def _row_lengths(data: mmap.mmap, start: int, element: Element, order: str) -> tuple[dict[str, int], int]:
