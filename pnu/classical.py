@@ -15,9 +15,9 @@ from pnu.io import Mesh
 from pnu.ops.apss import apss_project
 from pnu.ops.mesh import vertex_normals
 from pnu.ops.nearest import knn, nearest
-from pnu.ops.progress import Progress
 from pnu.ops.sampling import farthest_points_large
 from pnu.ops.surface import sample_poisson_disk
+from pnu.runtime.progress import Progress
 
 
 class APSS(nn.Module):

@@ -18,14 +18,15 @@ from torch import Tensor, nn
 from pnu import __version__, checkpoint
 from pnu.io import Cloud, check_cloud
 from pnu.models.surface import Surface
-from pnu.ops import patches, threads
+from pnu.ops import patches
 from pnu.ops.attributes import carry
 from pnu.ops.nearest import nearest
 from pnu.ops.normalize import Frame, unit_sphere_frame
 from pnu.ops.normals import estimate_normals, flip_to_reference
-from pnu.ops.parts import Keep, Parts, forget
-from pnu.ops.progress import Progress
-from pnu.ops.workers import Begin, Here, Processes, Work, Workers
+from pnu.runtime import threads
+from pnu.runtime.parts import Keep, Parts, forget
+from pnu.runtime.progress import Progress
+from pnu.runtime.workers import Begin, Here, Processes, Work, Workers
 
 MINIMUM = 16  # points of a cloud
 SMALLEST_PATCH = 64  # points that every network accepts; a smaller cloud is repeated up to it

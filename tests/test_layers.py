@@ -14,6 +14,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "pnu"
 # From the ground up. A module imports only from layers below its own, or from its own package (pnu.ops, pnu.data, ...).
 LAYERS = [
     {"pnu.doctor", "pnu.io"},
+    {"pnu.runtime"},
     {"pnu.ops"},
     {"pnu.data"},
     {"pnu.models", "pnu.losses", "pnu.metrics"},

@@ -11,7 +11,7 @@ from pnu.checkpoint import load
 from pnu.inference import upsample
 from pnu.models import surface
 from pnu.models.pnu import PNU
-from pnu.ops.parts import Parts
+from pnu.runtime.parts import Parts
 
 
 class Stop(Exception):

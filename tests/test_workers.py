@@ -17,7 +17,7 @@ from torch import Tensor
 from pnu import inference
 from pnu.inference import upsample
 from pnu.models import surface
-from pnu.ops.workers import Here, Processes
+from pnu.runtime.workers import Here, Processes
 from tests.test_parts import patches, sphere
 
 CLOUD = torch.arange(12.0, dtype=torch.float64).view(4, 3)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pnu.ops.threads import spread
+from pnu.runtime.threads import spread
 
 PIECE = 1024  # points whose neighbours are handled at once
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from pnu.models.neighborhoods import Groups
-from pnu.ops import threads
+from pnu.runtime import threads
 
 CHUNK = 2**17  # floats in the widest matrix of a chunk: 512 KiB, a handful of which fit the cache of a core
 T = TypeVar("T")

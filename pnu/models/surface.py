@@ -12,18 +12,18 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear, normalize
 
-from pnu.ops import threads
 from pnu.ops.blocks import along_curve
 from pnu.ops.frames import FEATURES, feet, local_frames
 from pnu.ops.grouping import gather
 from pnu.ops.nearest import Search, knn
 from pnu.ops.noise import noise_level
-from pnu.ops.parts import Keep, forget
-from pnu.ops.progress import Progress, Step, unheard
 from pnu.ops.sampling import farthest_points, farthest_points_large
 from pnu.ops.spacing import spacing
 from pnu.ops.spread import repel, tangent_discs
-from pnu.ops.workers import Here, Work, Workers
+from pnu.runtime import threads
+from pnu.runtime.parts import Keep, forget
+from pnu.runtime.progress import Progress, Step, silent
+from pnu.runtime.workers import Here, Work, Workers
 
 EACH = 3  # seeds of a point, in training, before they are thinned out
 PUSH = 0.1  # between rounds of training, beside the way from its point to a seed
@@ -321,7 +321,7 @@ def noise_in_spacings(cloud: Tensor) -> float:
     return noise_level(cloud[:, :3], cloud[:, 3:]) / spacing(cloud[:, :3].cpu().numpy())
 
 
-def seeds_around(cloud: Tensor, each: int, count: int, step: Step = unheard) -> Tensor:
+def seeds_around(cloud: Tensor, each: int, count: int, step: Step = silent) -> Tensor:
     """Points of a cloud (n, 6) and `each` seeds around each, thinned to (count, 6), with the points' normals."""
     step(0, 1)
     discs = tangent_discs(cloud[:, :3], cloud[:, 3:], each)
@@ -351,12 +351,12 @@ def spared(points: Tensor, error: Tensor, count: int) -> Tensor:
     return stays.nonzero()[:, 0]
 
 
-def evened(cloud: Tensor, steps: int, step: Step = unheard) -> Tensor:
+def evened(cloud: Tensor, steps: int, step: Step = silent) -> Tensor:
     """A cloud (m, 6) with points moved to an even spacing."""
     return torch.cat([repel(cloud[:, :3], cloud[:, 3:], steps=steps, step=step), cloud[:, 3:]], 1)
 
 
-def thin(cloud: Tensor, count: int, step: Step = unheard) -> Tensor:
+def thin(cloud: Tensor, count: int, step: Step = silent) -> Tensor:
     """Farthest points of a cloud (n, 6): (min(n, count), 6)."""
     if len(cloud) <= count:
         return cloud

@@ -4,8 +4,8 @@ import torch
 from torch import Tensor
 
 from pnu.ops.nearest import Search, nearest
-from pnu.ops.progress import Step, unheard
 from pnu.ops.sampling import farthest_points_large
+from pnu.runtime.progress import Step, silent
 
 
 def extract(cloud: Tensor, count: int, size: int, *, cover: bool = False) -> Tensor:
@@ -32,7 +32,7 @@ def extract(cloud: Tensor, count: int, size: int, *, cover: bool = False) -> Ten
     return torch.cat(found)
 
 
-def merge(patches: Tensor, n: int, step: Step = unheard) -> Tensor:
+def merge(patches: Tensor, n: int, step: Step = silent) -> Tensor:
     """Exactly n evenly spread points of overlapping patches: patches (count, size, C) -> (n, C), farthest points.
 
     The first 3 columns are coordinates. ValueError if the patches hold fewer than n points.

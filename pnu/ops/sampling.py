@@ -5,8 +5,8 @@ import torch
 from torch import Tensor
 
 from pnu.ops.nearest import gpu_kernels, nearest, per_cloud
-from pnu.ops.progress import Step, unheard
 from pnu.ops.thinning import farthest_in_blocks
+from pnu.runtime.progress import Step, silent
 
 try:
     import fpsample
@@ -49,7 +49,7 @@ def farthest_points(points: Tensor, m: int, *, start: int | Tensor = 0, skip_nea
     return torch.from_numpy(out)
 
 
-def farthest_points_large(points: np.ndarray | Tensor, m: int, *, step: Step = unheard) -> np.ndarray:
+def farthest_points_large(points: np.ndarray | Tensor, m: int, *, step: Step = silent) -> np.ndarray:
     """`farthest_points` from point 0 of one whole cloud (n, 3), in NumPy: idx (m,) int64, exactly m, all different.
 
     Beyond LARGE points it works block by block (`pnu.ops.thinning`), as evenly but from another point on, in time

@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 from pnu.ops.blocks import along_curve
 from pnu.ops.frames import tangent_basis
 from pnu.ops.nearest import Search, knn
-from pnu.ops.progress import Step, unheard
+from pnu.runtime.progress import Step, silent
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 ROWS = 2**18  # points whose neighbours are gathered at once: bounds the memory
@@ -48,7 +48,7 @@ def tangent_discs(points: Tensor, normals: Tensor, count: int, *, rank: int = RA
     return discs
 
 
-def repel(points: Tensor, normals: Tensor, *, steps: int, neighbours: int = 8, step: Step = unheard) -> Tensor:
+def repel(points: Tensor, normals: Tensor, *, steps: int, neighbours: int = 8, step: Step = silent) -> Tensor:
     """Even out the spacing: points (m, 3) push neighbours apart in their tangent planes, `steps` times.
 
     Points push each other with a force that falls to zero at about the distance that evenly spread points have, so

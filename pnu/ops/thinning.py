@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pnu.ops.blocks import Blocks, Index, split
-from pnu.ops.progress import Step, unheard
+from pnu.runtime.progress import Step, silent
 
 BLOCK = 2**16  # points
 SURPLUS = 1.006  # points to choose, of those wanted: the last ones are dropped for an exact count
@@ -56,7 +56,7 @@ def farthest_in_blocks(
     *,
     threads: int = 1,
     size: int | None = None,
-    step: Step = unheard,
+    step: Step = silent,
 ) -> Index:
     """m of the points (n, 3), as evenly spread as by `choose` from all at once, in about its order: (m,) indices.
 

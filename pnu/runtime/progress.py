@@ -8,5 +8,5 @@ Step = Callable[[int, int], None]
 """step(done, total): the same, of one stage."""
 
 
-def unheard(done: int, total: int) -> None:
-    """Tells nobody."""
+def silent(*step: object) -> None:
+    """Shows nothing: a `Progress`, and a `Step`."""

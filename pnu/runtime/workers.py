@@ -70,7 +70,7 @@ class Processes:
 
     def __enter__(self) -> "Processes":
         self.folder = tempfile.TemporaryDirectory(prefix="pnu-")
-        with _deaf():  # so are then the processes: Ctrl-C, which goes to all, is left to this one
+        with sigint_ignored():  # so are then the processes: Ctrl-C, which goes to all, is left to this one
             for _ in self.devices:
                 self.pool.submit(os.getpid)
         return self
@@ -94,7 +94,7 @@ class Processes:
 
 
 @contextmanager
-def _deaf() -> Iterator[None]:
+def sigint_ignored() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return

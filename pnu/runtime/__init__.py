@@ -1,0 +1,1 @@
+"""How things run, not what they are: threads, worker processes, finished parts, progress."""
