@@ -70,13 +70,15 @@ def reconstruct(cfg: Any) -> None:
     if truth is not None:
         errors = surfaces.surface_errors(mesh, truth, rng=np.random.default_rng(cfg.seed))
         extra = {"quality": errors.distance, "colors": errors.colors(cfg.limit, cfg.colormap)}
-    io.write_mesh(cfg.output, mesh, vertex_normals=vertex_normals(mesh), **extra)
+    notes = io.write_mesh(cfg.output, mesh, vertex_normals=vertex_normals(mesh), **extra)
     if truth is not None:
         report = cfg.report or str(Path(cfg.output).with_suffix(".json"))
         io.write_json(report, {"input": cfg.input, "truth": cfg.truth, "depth": surface.depth} | errors.summary())
         say(f"{errors.table()}\nreport: {report}")
     counts = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces, depth {surface.depth}"
     say(f"output: {cfg.output}, {counts}, {time.perf_counter() - started:.1f} s")
+    for note in notes:
+        say(f"        {note}")
     say(f"next:   python -m pnu.picture inputs=[{cfg.input},{cfg.output}] output=picture.png")
 
 

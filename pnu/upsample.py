@@ -80,12 +80,16 @@ def upsample(cfg: Any) -> None:
             progress=progress,
             parts=parts,
         )
-    attributes = inference.attributes(dense, cloud) if io.keeps_attributes(cfg.output) else {}
-    io.write_cloud(cfg.output, dense[:, :3], dense[:, 3:], attributes)
+    kept = io.kept_attributes(cfg.output, cloud.attributes)
+    held = cloud._replace(attributes={name: cloud.attributes[name] for name in kept})
+    notes = io.write_cloud(cfg.output, dense[:, :3], dense[:, 3:], inference.attributes(dense, held))
     if parts is not None:
         shutil.rmtree(parts, ignore_errors=True)
-    if cloud.attributes:
-        say(f"        {'carried over' if attributes else 'left out'}: {', '.join(cloud.attributes)}")
+    for told, names in (("carried over", kept), ("left out", [name for name in cloud.attributes if name not in kept])):
+        if names:
+            say(f"        {told}: {', '.join(names)}")
+    for note in notes:
+        say(f"        {note}")
     say(f"output: {cfg.output}, {len(dense)} points with unit normals, {time.perf_counter() - started:.1f} s")
     say(f"next:   python -m pnu.reconstruct input={cfg.output} output=mesh.ply")
 

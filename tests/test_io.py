@@ -67,7 +67,7 @@ def test_cloud_round_trip(tmp_path: Path, cloud: tuple[Array, Array], suffix: st
 def test_map_coordinates_keep_their_millimetres(tmp_path: Path, cloud: tuple[Array, Array], suffix: str) -> None:
     points = np.round(cloud[0] + [4.1e6, 5.3e6, 120], 4)
     write_cloud(tmp_path / f"c{suffix}", points)
-    assert np.abs(read_cloud(tmp_path / f"c{suffix}").points - points).max() < 1e-8
+    assert np.abs(read_cloud(tmp_path / f"c{suffix}").points - points).max() < (1e-6 if suffix == ".pcd" else 1e-8)
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])

@@ -14,7 +14,6 @@ from pnu.io.ply import read_ply
 from pnu.io.text import open_file, table, text_lines
 
 LARGEST = 1e30  # beyond, squared distances leave the range of float64 or what float32 can hold after scaling
-NORMAL_FIELDS = {".ply": ("nx", "ny", "nz"), ".pcd": ("normal_x", "normal_y", "normal_z")}
 
 
 class Cloud(NamedTuple):
@@ -114,6 +113,8 @@ def _from_table(path: Path, values: np.ndarray) -> Cloud:
     points, more = values[:, :3], values[:, 3:]
     if values.shape[1] == 3:
         return Cloud(points, None, {})
+    if values.shape[1] == 9:  # as it is written, see `pnu.io.output`
+        return Cloud(points, values[:, 6:], {"colors": as_colors(values[:, 3:6])})
     if values.shape[1] != 6:
         raise ValueError(
             f"{path}: has {values.shape[1]} columns; expected 3 (x y z) or 6 (x y z nx ny nz), remove the others"

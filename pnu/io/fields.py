@@ -1,6 +1,7 @@
 """Names that files give to a point's values: one place for ply, pcd, headers of text, and structured arrays."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from itertools import chain, count
 from typing import NamedTuple
 
 import numpy as np
@@ -82,6 +83,27 @@ def arranged(columns: Mapping[str, np.ndarray]) -> Fields:
                 for name in found:
                     del left[name]
     return Fields(points, normals, None if colors is None else as_colors(colors), left, tuple(notes))
+
+
+def distinct(names: Collection[str], own: Collection[str], *, length: int = 1000) -> dict[str, str]:
+    """Names as they are written: ASCII without blanks, at most so long, and none that another column has.
+
+    `own`: the columns of points, normals and colors that the format writes itself. What would be read as one of those,
+    or as the same attribute twice, gets `scalar_` before it.
+    """
+    taken = {name.lower() for name in own}
+    lower = {name.lower() for name in names}
+    for spelling in (*NORMALS, *COLORS):
+        taken |= set(spelling) if lower.issuperset(spelling) else set()
+    taken |= set(ALPHAS) if taken.issuperset(COLOR) else set()
+    result = {}
+    for name in names:
+        plain = "_".join(name.encode("ascii", "replace").decode().replace("?", "_").split())
+        spelled = (f"{prefix}{plain}"[:length] for prefix in chain(("", "scalar_"), map("scalar{}_".format, count(2))))
+        found = next(found for found in spelled if found and found.lower() not in taken)
+        taken.add(found.lower())
+        result[name] = found
+    return result
 
 
 def matching(names: tuple[str, ...], columns: Mapping[str, np.ndarray]) -> list[str]:

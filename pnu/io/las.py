@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from pnu.io import las_child
+from pnu.io.fields import XYZ, distinct
 
 SLICE = 2**20  # points
 SLICE_BYTES = 2**28  # at most, whatever size of a point a header claims
@@ -21,6 +22,7 @@ NORMAL = ("nx", "ny", "nz")  # extra dimensions
 CARRIED = ("intensity", "classification", "gps_time")
 FOREIGN = "pnu "  # before the name of a scalar that las has, but not with such values
 COLORS = ("red", "green", "blue")
+LONGEST = 32 - len(FOREIGN)  # bytes of a name
 Content = tuple[np.ndarray, np.ndarray | None, dict[str, np.ndarray]]
 
 
@@ -115,17 +117,24 @@ def _content(header: Any, slices: Iterator[Any]) -> Content:
     return points, normals, attributes
 
 
-def write_las(path: Path, points: np.ndarray, normals: np.ndarray | None, attributes: Mapping[str, np.ndarray]) -> None:
-    """Coordinates to a billionth of the extent; normals and scalars that las does not know as extra dimensions."""
+def write_las(
+    path: Path, points: np.ndarray, normals: np.ndarray | None, attributes: Mapping[str, np.ndarray]
+) -> dict[str, str]:
+    """Coordinates to a billionth of the extent; normals and scalars that las does not know as extra dimensions.
+
+    Returns under which name each attribute was written.
+    """
     laspy = _laspy(path)
+    names = distinct([name for name in attributes if name != "colors"], (*XYZ, *NORMAL, *COLORS), length=LONGEST)
     header = laspy.LasHeader(version="1.4", point_format=7 if "colors" in attributes else 6)
     header.offsets = np.floor(points.min(0))
     extent = max(float((points.max(0) - header.offsets).max()), 1e-9)
     header.scales = np.full(3, 10 ** np.ceil(np.log10(extent / 2**31 * 1.001)))
     known = {dimension.name: dimension for dimension in header.point_format.dimensions}
     columns = {}
-    for name, values in attributes.items():
-        if name != "colors":
+    for given, values in attributes.items():
+        if given != "colors":
+            name = names[given]
             exact = name not in known or (
                 values.ndim == 1 and np.array_equal(values.astype(known[name].dtype or np.uint8), values)
             )
@@ -134,7 +143,7 @@ def write_las(path: Path, points: np.ndarray, normals: np.ndarray | None, attrib
         columns |= dict(zip(NORMAL, normals.astype(np.float32).T, strict=True))
     header.add_extra_dims(
         [
-            laspy.ExtraBytesParams(name=name[:32], type=f"{values.shape[1] if values.ndim > 1 else ''}{values.dtype}")
+            laspy.ExtraBytesParams(name=name, type=f"{values.shape[1] if values.ndim > 1 else ''}{values.dtype}")
             for name, values in columns.items()
             if name not in known
         ]
@@ -146,10 +155,11 @@ def write_las(path: Path, points: np.ndarray, normals: np.ndarray | None, attrib
                 record = laspy.ScaleAwarePointRecord.zeros(len(points[part]), header=header)
                 record.x, record.y, record.z = points[part].T
                 for name, values in columns.items():
-                    record[name[:32]] = values[part]
+                    record[name] = values[part]
                 if "colors" in attributes:
                     for name, values in zip(COLORS, attributes["colors"][part].T, strict=False):
                         record[name] = values.astype(np.uint16) * 257
                 file.write_points(record)
     except RuntimeError as error:  # of the compressor, where the disk is full
         raise OSError(str(error)) from error
+    return names

@@ -10,6 +10,7 @@ from pnu.io.atomic import atomic_path
 from pnu.io.fields import NORMAL, XYZ, arranged, as_colors
 from pnu.io.ply import Lists, read_ply, write_ply
 from pnu.io.polygons import triangulate
+from pnu.io.shift import read_shift, shifted, single_is_enough
 from pnu.io.text import indices, known_suffix, open_file, table, text_lines
 
 
@@ -63,17 +64,18 @@ def write_mesh(
     vertex_normals: np.ndarray | None = None,
     colors: np.ndarray | None = None,
     quality: np.ndarray | None = None,
-) -> None:
-    """Write a mesh atomically, in the format of the suffix.
+) -> tuple[str, ...]:
+    """Write a mesh atomically, in the format of the suffix; returns what was changed, a line each.
 
     vertex_normals (v, 3), colors (v, 3) uint8 or 0..1, quality (v,) any scalar: kept by ply; obj and off keep the
-    first two; stl none.
+    first two; stl none. stl, which knows single precision only, names a shift where coordinates need one.
     """
     path = Path(path)
     suffix = known_suffix(path, "mesh", MESH_SUFFIXES)
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     if colors is not None and np.issubdtype(np.asarray(colors).dtype, np.floating):
         colors = np.rint(np.clip(colors, 0, 1) * 255)
+    notes: tuple[str, ...] = ()
     with atomic_path(path) as temporary:
         if suffix == ".ply":
             columns = xyz_columns(vertices) | ply_normals(vertex_normals)
@@ -83,22 +85,17 @@ def write_mesh(
                 columns["quality"] = np.asarray(quality, np.float32)
             write_ply(temporary, columns, faces)
         elif suffix == ".stl":
-            _write_stl(temporary, vertices, faces)
+            notes = _write_stl(temporary, vertices, faces)
         else:
             writer = write_obj if suffix == ".obj" else write_off
             writer(temporary, Geometry(vertices, faces, vertex_normals, colors))
-
-
-def single_if_enough(points: np.ndarray) -> np.ndarray:
-    """As float32, which every program reads, where that is good to a millionth of the extent; else float64."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        single = points.astype(np.float32)
-        moved = np.abs(single - points).max(initial=0)
-    return single if moved <= 1e-6 * np.ptp(points, axis=0).max(initial=0) else points.astype(np.float64)
+    return notes
 
 
 def xyz_columns(points: np.ndarray) -> dict[str, np.ndarray]:
-    return dict(zip(XYZ, single_if_enough(points).T, strict=True))
+    """In single precision, which every program reads, where that is enough."""
+    kind = np.float32 if single_is_enough(points) else np.float64
+    return dict(zip(XYZ, points.astype(kind).T, strict=True))
 
 
 def ply_normals(normals: np.ndarray | None) -> dict[str, np.ndarray]:
@@ -237,6 +234,8 @@ def _read_stl(path: Path) -> Geometry:
     if len(data) >= 84 and len(data) == 84 + 50 * count:
         triangles = np.frombuffer(data, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("tag", "<u2")], count, 84)
         corners = triangles["corners"].reshape(-1, 3).astype(np.float64)
+        if (shift := read_shift(data[:80].decode("ascii", "replace"))) is not None:
+            corners += shift
     elif data.lstrip().startswith(b"solid") and b"\0" not in data:
         rows = [line.split("vertex", 1)[1] for line in text_lines(path) if line.lstrip().startswith("vertex")]
         corners = table(path, lambda: rows)
@@ -278,16 +277,18 @@ def write_off(path: Path, geometry: Geometry) -> None:
         np.savetxt(handle, faces, "3 %d %d %d")
 
 
-def _write_stl(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+def _write_stl(path: Path, vertices: np.ndarray, faces: np.ndarray) -> tuple[str, ...]:
+    single = shifted(vertices)
     triangles = np.zeros(len(faces), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("tag", "<u2")])
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     triangles["normal"] = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
-    triangles["corners"] = corners
+    triangles["corners"] = single.points[faces]
     with path.open("wb") as handle:
-        handle.write(b"binary stl".ljust(80) + len(faces).to_bytes(4, "little"))
+        handle.write(f"binary stl {single.text}".encode().ljust(80)[:80] + len(faces).to_bytes(4, "little"))
         triangles.tofile(handle)
+    return single.notes
 
 
 READERS: dict[str, Callable[[Path], Geometry]] = {

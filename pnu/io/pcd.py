@@ -1,19 +1,21 @@
 """Point Cloud Library's format: text, binary, and binary compressed (LZF)."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from pnu.io.shift import read_shift
 from pnu.io.text import table
 
 KINDS = {"I": "i", "U": "u", "F": "f"}
 
 
 def read_pcd(path: Path) -> dict[str, np.ndarray]:
-    """Fields by name, (n,) or (n, count)."""
+    """Fields by name, (n,) or (n, count); x y z as float64 with the shift that a comment of the header names."""
     data = path.read_bytes()
     header, start = _header(path, data)
+    shift = read_shift(data[:start].decode("ascii", "replace"))
     names = header["FIELDS"]
     try:
         sizes = [int(word) for word in header["SIZE"]]
@@ -43,11 +45,14 @@ def read_pcd(path: Path) -> dict[str, np.ndarray]:
         columns = _compressed(path, data, start, points, dtype)
     else:
         raise ValueError(f"{path}: DATA is '{mode[:30]}'; expected ascii, binary or binary_compressed")
-    return {
+    found = {
         name: np.ascontiguousarray(column[:, 0] if column.shape[1] == 1 else column)
         for name, column in zip(names, columns, strict=True)
         if name != "_"  # padding
     }
+    if shift is not None:
+        found |= {axis: found[axis] + by for axis, by in zip("xyz", shift, strict=True) if axis in found}
+    return found
 
 
 def _header(path: Path, data: bytes) -> tuple[dict[str, list[str]], int]:
@@ -138,7 +143,7 @@ def decompress_lzf(data: bytes, size: int) -> bytes:
     return bytes(out)
 
 
-def write_pcd(path: Path, fields: Mapping[str, np.ndarray]) -> None:
+def write_pcd(path: Path, fields: Mapping[str, np.ndarray], comments: Sequence[str] = ()) -> None:
     """Binary pcd of fields (n,) or (n, count)."""
     columns = {name: values.reshape(len(values), -1) for name, values in fields.items()}
     dtype = np.dtype([(name, v.dtype.newbyteorder("<"), (v.shape[1],)) for name, v in columns.items()])
@@ -146,6 +151,7 @@ def write_pcd(path: Path, fields: Mapping[str, np.ndarray]) -> None:
     for name, values in columns.items():
         rows[name] = values
     header = [
+        *(f"# {comment}" for comment in comments),
         "VERSION 0.7",
         "FIELDS " + " ".join(columns),
         "SIZE " + " ".join(str(v.dtype.itemsize) for v in columns.values()),
