@@ -22,7 +22,7 @@ from pnu.ops import patches
 from pnu.ops.attributes import carry
 from pnu.ops.nearest import nearest
 from pnu.ops.normalize import Frame, unit_sphere_frame
-from pnu.ops.normals import estimate_normals, flip_to_reference
+from pnu.ops.normals import complete_normals, estimate_normals, flip_to_reference
 from pnu.runtime import threads
 from pnu.runtime.parts import Keep, Parts, forget
 from pnu.runtime.progress import Progress
@@ -74,7 +74,9 @@ def upsample(
 
     Args:
         points: (n, 3), or (n, 6) with normals, n >= 16, in any unit and anywhere; an array, or a tensor on any device.
-        normals: (n, 3), of any length but zero; estimated and oriented where missing here and in points.
+            Points that are not finite, or at the place of another, are left out: n is the number of the others, and
+            `pnu.io.check_cloud` tells what it finds.
+        normals: (n, 3), of any length; estimated and oriented where missing, zero or NaN here and in points.
         ratio: points out for each point in, any number >= 1.
         model: network, run folder, file of weights, the name of weights that come with pnu (`pnu.weights`), or
             "newest", the run that finished last under outputs/. "surface" takes the weights made for estimated normals
@@ -137,9 +139,8 @@ def attributes(dense: np.ndarray, cloud: Cloud) -> dict[str, np.ndarray]:
     """Colours and scalars of a cloud at the points of its denser version (m, 6), see `pnu.ops.attributes`."""
     if not cloud.attributes:
         return {}
-    normals = cloud.normals
-    if normals is None:
-        normals = estimate_normals(torch.from_numpy(cloud.points)[None])[0].numpy()
+    given = None if cloud.normals is None else torch.from_numpy(cloud.normals)
+    normals = complete_normals(torch.from_numpy(cloud.points), given).numpy()
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     sparse = np.hstack([cloud.points, normals / np.maximum(length, 1e-300)])
     return {name: carry(dense, sparse, values) for name, values in cloud.attributes.items()}
@@ -263,23 +264,19 @@ def _digest(network: nn.Module, sparse: Tensor, count: int, upsampler: object) -
 def _prepare(cloud: Cloud, progress: Progress) -> tuple[Tensor, Frame]:
     """Different points in a fixed order with normals, (n, 6) float64 in the unit sphere, and the way back."""
     points, normals = cloud.points, cloud.normals
-    order = np.lexsort([*(() if normals is None else normals.T), *points.T])
-    repeated = np.zeros(len(points), bool)
-    repeated[1:] = (np.diff(points[order], axis=0) == 0).all(1)
-    kept = order[~repeated]
-    if len(kept) < MINIMUM:
-        raise ValueError(f"points: holds {len(kept)} different points; at least {MINIMUM} are needed")
-    frame = unit_sphere_frame(torch.from_numpy(points[kept])[None])
-    unit = frame.to_unit(torch.from_numpy(points[kept])[None])
+    order = np.lexsort(points.T)
+    frame = unit_sphere_frame(torch.from_numpy(points[order])[None])
+    unit = frame.to_unit(torch.from_numpy(points[order])[None])
     extent = torch.linalg.svdvals(unit[0] - unit[0].mean(0))
     if extent[1] < 1e-9 * extent[0]:
         raise ValueError(f"points: all {len(points)} points lie on a line; expected points on a surface")
-    if normals is None:
+    given = None if normals is None else torch.from_numpy(normals[order])
+    if given is None or given.isnan().any():
         progress("normals", 0, 1)
-        directions = estimate_normals(unit)[0]
+        directions = complete_normals(unit[0], given)
         progress("normals", 1, 1)
     else:
-        directions = torch.from_numpy(normals[kept])
+        directions = given
     return torch.cat([unit[0], directions], 1), frame
 
 

@@ -69,6 +69,9 @@ def picture(cfg: Any) -> None:
     if not cfg.quiet:
         kinds = (f"{'mesh' if s.mesh is not None else 'cloud'}, color={s.source(cfg.color)}" for s in shapes)
         print(f"panels: {', '.join(f'{path} ({kind})' for path, kind in zip(inputs, kinds, strict=True))}")
+        for shape in shapes:
+            for note in shape.notes:
+                print(f"        {shape.path}: {note}")
         height, width = image.shape[:2]
         print(f"output: {cfg.output}, {width} x {height} pixels, {time.perf_counter() - started:.1f} s")
 

@@ -40,9 +40,11 @@ def reconstruct(cfg: Any) -> None:
     started = time.perf_counter()
     say: Callable[[str], None] = (lambda text: None) if cfg.quiet else print
     check(cfg)
-    points, normals, attributes, _ = io.read_cloud(cfg.input, normals=cfg.normals == "auto")
+    points, normals, attributes, notes = io.read_cloud(cfg.input, normals=cfg.normals == "auto")
     origin = "with normals" if normals is not None else "normals estimated and oriented"
     say(f"input:  {cfg.input}, {len(points)} points, {origin}")
+    for note in notes:
+        say(f"        {note}")
     truth = None
     if cfg.truth:
         truth = io.read_mesh(cfg.truth)

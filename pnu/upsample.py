@@ -51,6 +51,8 @@ def upsample(cfg: Any) -> None:
     cloud = io.read_cloud(cfg.input, normals=cfg.normals == "auto")
     origin = "with normals" if cloud.normals is not None else "normals estimated and oriented"
     say(f"input:  {cfg.input}, {len(cloud.points)} points, {origin}")
+    for note in cloud.notes:
+        say(f"        {note}")
 
     from pnu import inference, weights
     from pnu.checkpoint import NEWEST

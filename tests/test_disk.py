@@ -28,7 +28,7 @@ writers = {
     "w.safetensors": lambda path: weights.write(path, {}, state),
     "p.h5": lambda path: patchset.build(path, {"mug": functools.partial(shapes.make, "mug")}, 2),
     "run": lambda path: checkpoint.save(path, torch.nn.Linear(300, 300), {}, {}),
-    **{f"c{suffix}": lambda path: io.write_cloud(path, torch.rand(9000, 3).numpy()) for suffix in io.CLOUD_SUFFIXES},
+    **{f"c{suffix}": lambda path: io.write_cloud(path, torch.rand(9000, 3).numpy()) for suffix in io.OUTPUT_SUFFIXES},
     **{f"m{suffix}": lambda path: io.write_mesh(path, shapes.make("mug")) for suffix in io.MESH_SUFFIXES},
 }
 torch.nn.Linear.ratio = 1

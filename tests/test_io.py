@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pnu.io import (
-    CLOUD_SUFFIXES,
     MESH_SUFFIXES,
+    OUTPUT_SUFFIXES,
     Mesh,
     atomic_path,
     meshes_of,
@@ -45,7 +45,7 @@ def volume(mesh: Mesh) -> float:
 # Clouds
 
 
-@pytest.mark.parametrize("suffix", sorted(CLOUD_SUFFIXES))
+@pytest.mark.parametrize("suffix", sorted(OUTPUT_SUFFIXES))
 @pytest.mark.parametrize("with_normals", [True, False])
 def test_cloud_round_trip(tmp_path: Path, cloud: tuple[Array, Array], suffix: str, with_normals: bool) -> None:
     points, normals = cloud
@@ -63,7 +63,7 @@ def test_cloud_round_trip(tmp_path: Path, cloud: tuple[Array, Array], suffix: st
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
-@pytest.mark.parametrize("suffix", sorted(CLOUD_SUFFIXES))
+@pytest.mark.parametrize("suffix", sorted(OUTPUT_SUFFIXES))
 def test_map_coordinates_keep_their_millimetres(tmp_path: Path, cloud: tuple[Array, Array], suffix: str) -> None:
     points = np.round(cloud[0] + [4.1e6, 5.3e6, 120], 4)
     write_cloud(tmp_path / f"c{suffix}", points)

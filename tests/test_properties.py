@@ -88,7 +88,7 @@ def test_order(dense: Array, normals: Array | None) -> None:
 
 def test_duplicates(dense: Array, normals: Array | None) -> None:
     more = np.r_[0 : len(POINTS), 0:50]
-    repeated = upsample(POINTS[more], None if normals is None else normals[more], ratio=len(dense) / len(more))
+    repeated = upsample(POINTS[more], None if normals is None else normals[more])
     np.testing.assert_array_equal(repeated, dense)
 
 

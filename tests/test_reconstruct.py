@@ -157,3 +157,11 @@ def test_picture_refuses(
     keys = {"inputs": f"[{folder / 'truth.ply'}]", "output": "a.png"} | keys
     line = refused(capsys, picture, **keys | {"output": tmp_path / keys["output"]})
     assert re.search(message, line)
+
+
+def test_a_cloud_whose_every_point_is_repeated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_cloud(tmp_path / "c.ply", *np.hsplit(np.repeat(sphere_points(300), 20, 0), 2))
+    run(reconstruct, input=tmp_path / "c.ply", output=tmp_path / "m.ply")
+    said = capsys.readouterr().out
+    assert "c.ply, 300 points, with normals\n        5700 of 6000 points left out: at the place of another\n" in said
+    assert "depth 5," in said  # 11, the deepest, where the spacing seemed zero

@@ -114,7 +114,9 @@ def pair_cases(
         if shapes is not None and path.stem not in shapes:
             continue
         truth, frame = read_truth(Path(root) / "truth", path.stem, truth_points, seed, warn)
-        points, given, *_ = read_cloud(path, normals=normals)
+        points, given, _, notes = read_cloud(path, normals=normals)
+        for note in notes:
+            warn(f"{path}: {note}")
         points = moved(points, frame)
         check_frame(points, truth, path)
         yield Case("given", points, given, truth)

@@ -11,7 +11,7 @@ from pnu import inference, metrics
 from pnu.evaluation.cases import Case, Truth, generator
 from pnu.evaluation.cost import Cost
 from pnu.metrics.functional import ClosestPoints
-from pnu.ops.normals import estimate_normals
+from pnu.ops.normals import complete_normals
 from pnu.ops.surface import closest_points, sample_poisson_disk
 
 Row = dict[str, Any]
@@ -77,9 +77,8 @@ def measure(cloud: np.ndarray, truth: Truth, closest: ClosestPoints = closest_po
 
 
 def normals_of(case: Case) -> np.ndarray:
-    if case.normals is not None:
-        return case.normals
-    return estimate_normals(torch.from_numpy(case.points)[None])[0].numpy()
+    given = None if case.normals is None else torch.from_numpy(case.normals)
+    return complete_normals(torch.from_numpy(case.points), given).numpy()
 
 
 def network_upsampler(

@@ -1,6 +1,6 @@
 """Point clouds read: ply, xyz, txt, pcd, obj, off, npy, las, laz."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,11 +14,13 @@ from pnu.io.ply import read_ply
 from pnu.io.text import open_file, table, text_lines
 
 LARGEST = 1e30  # beyond, squared distances leave the range of float64 or what float32 can hold after scaling
+LENGTH = 0.05  # by which that of a unit normal may differ from 1, as text rounds it
 
 
 class Cloud(NamedTuple):
-    """Points (n, 3) float64, unit normals (n, 3) float64 or None, and what else the file says about each point.
+    """Points, their normals or None, and what else the file says about each point.
 
+    points (n, 3) float64; normals (n, 3) float64 of length 1, NaN where a point has none.
     attributes: name -> (n,) or (n, k). Colours are "colors", (n, 3) or (n, 4) uint8.
     notes: what was found and done while it was read, a line each: left out, taken for something, changed.
     """
@@ -31,13 +33,13 @@ class Cloud(NamedTuple):
 
 @np.errstate(invalid="ignore", over="ignore")  # what is not finite is named by the checks
 def read_cloud(path: str | Path, *, minimum: int = 16, normals: bool = True) -> Cloud:
-    """Read a point cloud; normals are brought to unit length, or left out with `normals=False`.
+    """Read a point cloud, checked as by `check_cloud`; with `normals=False` without normals.
 
     Text has three columns (x y z) or six (x y z and a normal, or a colour where the last three are no unit vectors);
     of a mesh the vertices are taken. Coordinates stay float64.
 
     Raises `ValueError` (one line: file, what was expected, what was found, what to do) for a missing, empty, damaged
-    or unknown file, fewer than `minimum` points, NaN or infinity, points that are all equal, and normals of length 0.
+    or unknown file, fewer than `minimum` points that can be used, and points that are all equal.
     """
     path = Path(path)
     suffix = open_file(path, "point cloud", CLOUD_SUFFIXES)
@@ -49,41 +51,84 @@ def read_cloud(path: str | Path, *, minimum: int = 16, normals: bool = True) -> 
 
 @np.errstate(invalid="ignore", over="ignore")
 def check_cloud(cloud: Cloud, name: str, *, minimum: int = 16) -> Cloud:
-    """The cloud with float64 points and unit normals; `ValueError`, beginning with `name`, if it cannot be used."""
+    """The cloud as everything after it takes it, with a note for each thing that was changed.
+
+    Points float64, finite, each place once; normals of length 1, NaN where a point has none, None where all have none.
+    `ValueError`, beginning with `name`, if too little is left or the shapes are wrong.
+    """
     points = np.asarray(cloud.points, np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"{name}: expected points of shape (n, 3), found {points.shape}; give one row a point")
-    count = len(points)
+    count, notes = len(points), [*cloud.notes]
     if count < minimum:
         raise ValueError(f"{name}: holds {count} points; at least {minimum} are needed")
-    bad = np.flatnonzero(~(np.abs(points) < LARGEST).all(axis=1))
-    if len(bad):
-        raise ValueError(
-            f"{name}: {len(bad)} of {count} points hold NaN, infinity or numbers beyond {LARGEST:g} "
-            f"(the first: number {bad[0] + 1}); remove them"
-        )
-    if count > 1 and np.ptp(points, axis=0).max() <= max(1e-12 * np.abs(points).max(), 1 / LARGEST):
+    if cloud.normals is not None and np.shape(cloud.normals) != points.shape:
+        raise ValueError(f"{name}: expected normals of shape {points.shape}, found {np.shape(cloud.normals)}")
+    good = (np.abs(points) < LARGEST).all(axis=1)
+    if not good.all():
+        notes.append(f"{count - good.sum()} of {count} points left out: NaN, infinite or beyond {LARGEST:g}")
+        if good.sum() < minimum:
+            raise ValueError(f"{name}: {notes[-1]}; at least {minimum} others are needed")
+        cloud = chosen(cloud._replace(points=points), np.flatnonzero(good))
+    count = len(cloud.points)
+    if count > 1 and np.ptp(cloud.points, axis=0).max() <= max(1e-12 * np.abs(cloud.points).max(), 1 / LARGEST):
         raise ValueError(f"{name}: all {count} points are equal; expected points on a surface")
-    normals = cloud.normals
+    first = first_of_each_place(cloud.points, cloud.normals)
+    if len(first) < count:
+        notes.append(f"{count - len(first)} of {count} points left out: at the place of another")
+        if len(first) < minimum:
+            raise ValueError(f"{name}: holds {len(first)} different points; at least {minimum} are needed")
+        cloud = chosen(cloud, first)
+    normals, found = unit_normals(cloud.normals)
+    return Cloud(np.asarray(cloud.points, np.float64), normals, dict(cloud.attributes), (*notes, *found))
+
+
+def chosen(cloud: Cloud, rows: np.ndarray) -> Cloud:
+    """Some points of a cloud, with what belongs to them."""
+    normals = None if cloud.normals is None else np.asarray(cloud.normals)[rows]
+    attributes = {name: np.asarray(values)[rows] for name, values in cloud.attributes.items()}
+    return Cloud(cloud.points[rows], normals, attributes, cloud.notes)
+
+
+def first_of_each_place(points: np.ndarray, normals: np.ndarray | None) -> np.ndarray:
+    """One row for each place of points (n, 3), (m,) in order; of several normals the first in theirs."""
+    order, new = _places(points.T)
+    if new.all():
+        return np.arange(len(points))
     if normals is not None:
-        normals = np.asarray(normals, np.float64)
-        if normals.shape != points.shape:
-            raise ValueError(f"{name}: expected normals of shape {points.shape}, found {normals.shape}")
-        cure = "repair them, or have all normals estimated (normals=estimate)"
-        bad = np.flatnonzero(~np.isfinite(normals).all(axis=1))
-        if len(bad):
-            raise ValueError(
-                f"{name}: {len(bad)} of {count} normals hold NaN or infinity (the first: number {bad[0] + 1}); {cure}"
-            )
-        normals = normals / np.maximum(np.abs(normals).max(axis=1, keepdims=True), 1e-300)
-        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-        bad = np.flatnonzero(lengths < 0.5)
-        if len(bad):
-            raise ValueError(
-                f"{name}: {len(bad)} of {count} normals have length zero (the first: number {bad[0] + 1}); {cure}"
-            )
-        normals = normals / lengths
-    return Cloud(points, normals, dict(cloud.attributes), cloud.notes)
+        order, new = _places([*np.asarray(normals).T, *points.T])
+    return np.sort(order[new])
+
+
+def _places(keys: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Rows sorted by keys, x y z the last of them, and which of them is the first of its place."""
+    keys = list(keys)
+    order = np.lexsort(keys)
+    new = np.ones(len(order), bool)
+    new[1:] = np.any([np.diff(key[order]) != 0 for key in keys[-3:]], axis=0)
+    return order, new
+
+
+def unit_normals(normals: np.ndarray | None) -> tuple[np.ndarray | None, list[str]]:
+    """Normals (n, 3) brought to length 1, NaN where they have no direction, None where none has; and what to say."""
+    if normals is None:
+        return None, []
+    normals = np.asarray(normals, np.float64)
+    largest = np.abs(normals).max(axis=1, keepdims=True)
+    with np.errstate(divide="ignore"):
+        scaled = normals / largest  # squares of the smallest and the largest would leave float64
+    missing = ~np.isfinite(scaled).all(axis=1)
+    if missing.all():
+        return None, ["normals are all zero or NaN: taken as none"]
+    scaled[missing] = np.nan
+    size = np.linalg.norm(scaled, axis=1, keepdims=True)
+    lengths = (largest * size)[~missing]
+    notes = []
+    if missing.any():
+        notes.append(f"{missing.sum()} of {len(normals)} normals are zero or NaN: theirs are estimated")
+    if np.mean(np.abs(lengths - 1) > LENGTH) > 0.01:
+        notes.append(f"normals have lengths {lengths.min():.2g} to {lengths.max():.2g}: their directions are taken")
+    return scaled / size, notes
 
 
 def _read_text(path: Path) -> Cloud:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from pnu.io.atomic import atomic_path, check_writable
-from pnu.io.cloud import CLOUD_SUFFIXES, Cloud
+from pnu.io.cloud import Cloud
 from pnu.io.fields import COLOR, NORMAL, XYZ, as_colors, distinct
 from pnu.io.las import write_las
 from pnu.io.mesh import Geometry, ply_normals, write_obj, write_off, xyz_columns
@@ -34,7 +34,7 @@ def write_cloud(
     billionths of the extent in las and laz; and float64 otherwise.
     """
     path = Path(path)
-    suffix = known_suffix(path, "point cloud", CLOUD_SUFFIXES)
+    suffix = known_suffix(path, "point cloud to write", OUTPUT_SUFFIXES)
     points = np.asarray(points, np.float64)
     cloud = Cloud(points, None if normals is None else np.asarray(normals, np.float64), dict(attributes or {}))
     for name, values in (cloud.attributes | ({} if cloud.normals is None else {"normals": cloud.normals})).items():
@@ -50,7 +50,7 @@ def write_cloud(
 
 def check_output(path: str | Path) -> None:
     """`ValueError` where `write_cloud` would refuse this name: unknown suffix, no such folder, not writable."""
-    known_suffix(Path(path), "point cloud", CLOUD_SUFFIXES)
+    known_suffix(Path(path), "point cloud to write", OUTPUT_SUFFIXES)
     check_writable(path)
 
 
@@ -157,3 +157,4 @@ WRITERS: dict[str, Callable[[Path, Cloud], list[str]]] = {
     ".las": _write_las,
     ".laz": _write_las,
 }
+OUTPUT_SUFFIXES = frozenset(WRITERS)

@@ -5,16 +5,20 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from pnu.io import CLOUD_SUFFIXES, MESH_SUFFIXES, Mesh, read_cloud, read_mesh
-from pnu.io.mesh import READERS
+from pnu.io.cloud import READERS as CLOUD_READERS
+from pnu.io.mesh import READERS as MESH_READERS
 from pnu.ops.colors import normal_colors, typical_limit, value_colors
 from pnu.ops.mesh import vertex_normals
+from pnu.ops.normals import complete_normals
 from pnu.pictures.camera import Camera
 from pnu.pictures.figure import ColorBar
 from pnu.pictures.render import STONE, render_cloud, render_mesh
 
+MINIMUM = 16  # points from which normals can be estimated
 COLORS = ("auto", "quality", "stored", "normal", "plain")
 
 
@@ -26,6 +30,7 @@ class Shape(NamedTuple):
     normals: NDArray[np.float64] | None  # (n, 3)
     mesh: Mesh | None
     attributes: dict[str, NDArray]
+    notes: tuple[str, ...] = ()  # what was found and done while the file was read
 
     def source(self, color: str) -> str:
         """What a choice of COLORS means here: never auto. ValueError where the file lacks it."""
@@ -62,12 +67,16 @@ class Shape(NamedTuple):
 def read_shape(path: str) -> Shape:
     """A file with faces as a mesh, any other as a cloud. ValueError as in `pnu.io`."""
     suffix = Path(path).suffix.lower()
-    if suffix in MESH_SUFFIXES and Path(path).is_file() and len(READERS[suffix](Path(path)).faces):
+    if suffix in MESH_SUFFIXES and Path(path).is_file() and len(MESH_READERS[suffix](Path(path)).faces):
         mesh = read_mesh(path)
-        attributes = read_cloud(path, minimum=3, normals=False).attributes if suffix in CLOUD_SUFFIXES else {}
+        # as the file has them, one a vertex: a cloud's points at one place are one
+        attributes = CLOUD_READERS[suffix](Path(path)).attributes if suffix in CLOUD_SUFFIXES else {}
         return Shape(path, mesh.vertices, vertex_normals(mesh), mesh, attributes)
-    cloud = read_cloud(path, minimum=1)
-    return Shape(path, cloud.points, cloud.normals, None, cloud.attributes)
+    points, normals, attributes, notes = read_cloud(path, minimum=1)
+    if normals is not None and np.isnan(normals).any():
+        enough = len(points) >= MINIMUM
+        normals = complete_normals(torch.from_numpy(points), torch.from_numpy(normals)).numpy() if enough else None
+    return Shape(path, points, normals, None, attributes, notes)
 
 
 def quality_bar(shapes: Sequence[Shape], color: str, limit: float | None, colormap: str, label: str) -> ColorBar | None:

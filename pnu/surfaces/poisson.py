@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pnu.doctor import install_line, missing_packages
 from pnu.io import Cloud, Mesh, check_cloud
 from pnu.ops.mesh import open_edges
+from pnu.ops.normals import complete_normals
 from pnu.ops.spacing import spacing
 from pnu.ops.surface import closest_points, face_normals, signed_volume
 from pnu.surfaces import poisson_child
@@ -59,7 +61,7 @@ class Surface(NamedTuple):
 def reconstruct(
     points: NDArray, normals: NDArray, *, depth: int | None = None, timeout: float = 600, name: str = "cloud"
 ) -> Surface:
-    """The surface through points `(n, 3)` along normals `(n, 3)` of any length, in their frame and unit.
+    """The surface through points `(n, 3)` along normals `(n, 3)`; those of no length are estimated. In their frame.
 
     The work is done by a child process, which may crash or hang without loss. The same input gives the same mesh.
 
@@ -76,6 +78,7 @@ def reconstruct(
         raise ValueError(f"{name}: has no normals; Poisson reconstruction needs them, estimate them first")
     if depth is not None and not 1 <= depth <= 16:
         raise ValueError(f"depth={depth}: expected 1 to 16, 8 is usual")
+    given = complete_normals(torch.from_numpy(points), torch.from_numpy(given)).numpy()
     depth = octree_depth(points) if depth is None else depth
     center, radius = (points.min(0) + points.max(0)) / 2, np.ptp(points, axis=0).max() / 2
     found = run_child((points - center) / radius, given, depth, timeout)
