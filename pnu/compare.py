@@ -1,6 +1,5 @@
 """Compare trained networks and classical methods on one page: `python -m pnu.compare methods=[FOLDER,apss]`."""
 
-import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from pnu.run import command, doc
 from pnu.run.groups import Data
 from pnu.run.progress import steps
+from pnu.run.quoting import quoted, typed_line
 
 if TYPE_CHECKING:
     from pnu.evaluation import Case, Upsampler
@@ -75,14 +75,13 @@ def compare(cfg: Any) -> None:
         rows = list(evaluation.evaluate(methods, source.cases, **options))
     if not cfg.quiet:
         evaluation.print_tables(rows, f"{', '.join(methods)} on {source.name}")
-    command_line = shlex.join(["python", "-m", "pnu.compare", *sys.argv[1:]])
     with steps(len(shown), cfg.quiet) as step:
         written = comparison.write_comparison(
             output,
             rows,
             list(shown.values()),
             title=f"Point cloud upsampling, {cfg.ratio:g} times: {', '.join(methods)}",
-            head=[evaluation.legend(rows), f"Made by: {command_line}"],
+            head=[evaluation.legend(rows), f"Made by: {typed_line()}"],
             settings={key: cfg[key] for key in SETTINGS} | {"data": source.name, "versions": versions()},
             rebuilt_kinds=rebuilt_kinds,
             look=comparison.Look(cfg.up, cfg.azimuth, cfg.elevation, cfg.size, cfg.colormap),
@@ -106,7 +105,7 @@ def upsamplers(cfg: Any) -> dict[str, "Upsampler"]:
 
     found: dict[str, Upsampler] = {}
     for method in [one for given in cfg.methods for one in runs_of_sweep(given) or [given]]:
-        name, _, folder = method.rpartition(":")
+        name, _, folder = ("", "", method) if Path(method).exists() else method.rpartition(":")
         if folder in classical.METHODS:
             model, name = classical.method(folder), name or folder
         elif Path(folder).is_dir():
@@ -117,7 +116,8 @@ def upsamplers(cfg: Any) -> dict[str, "Upsampler"]:
             known = ", ".join([*classical.METHODS, *weights.names()])
             raise ValueError(f"methods={method}: expected a run folder, or one of {known}; found neither")
         if name in found or name in ("input", "floor", "truth"):
-            raise ValueError(f"methods={method}: the name {name} is taken; give another one, methods=[NAME:{folder}]")
+            cure = quoted("methods", [f"NAME:{folder}"])
+            raise ValueError(f"methods={method}: the name {name} is taken; give another one, {cure}")
         found[name] = evaluation.network_upsampler(
             model,
             cfg.ratio,

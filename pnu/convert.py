@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pnu.run import command, doc
+from pnu.run import command, doc, shell_line
 
 
 @dataclass
@@ -45,7 +45,7 @@ def convert(cfg: Any) -> None:
     if not cfg.quiet:
         print(f"input:  {cfg.input}, epoch {epoch}")
         print(f"run:    {output}")
-        print(f"next:   python -m pnu.upsample run={output} input=cloud.ply output=dense.ply")
+        print(f"next:   {shell_line('upsample', run=output, input='cloud.ply', output='dense.ply')}")
 
 
 main = command(convert, Convert)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pnu.run import command, doc
+from pnu.run import command, doc, shell_line
 from pnu.run.groups import Data
 from pnu.run.progress import steps
 
@@ -85,9 +85,9 @@ def evaluate(cfg: Any) -> None:
     if not cfg.quiet:
         evaluation.print_tables(rows, f"{subject}, normals of the input {NORMALS[cfg.normals]}")
         print(f"output: {output}/metrics.json, metrics.csv{', clouds/' if cfg.save else ''}")
-        data = f" data=meshes data.root={cfg.data.root}" if cfg.data.get("root") else ""
+        data = {"data": "meshes", "data.root": cfg.data.root} if cfg.data.get("root") else {}
         rival = "poisson" if subject == "apss" else "apss"
-        print(f"next:   python -m pnu.compare methods=[{subject},{rival}]{data}")
+        print(f"next:   {shell_line('compare', methods=[subject, rival], **data)}")
 
 
 def check(cfg: Any) -> None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pnu.run import command, doc
+from pnu.run import command, doc, shell_line
 
 
 @dataclass
@@ -29,7 +29,7 @@ def export(cfg: Any) -> None:
     weights.write(cfg.output, model, network.state_dict(), getattr(network, "patch_size", None))
     if not cfg.quiet:
         print(f"output: {cfg.output}, {Path(cfg.output).stat().st_size / 1e6:.2f} MB")
-        print(f"next:   python -m pnu.upsample run={cfg.output} input=cloud.ply output=dense.ply")
+        print(f"next:   {shell_line('upsample', run=cfg.output, input='cloud.ply', output='dense.ply')}")
 
 
 main = command(export, Export)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pnu.run import build, command, doc
+from pnu.run import build, command, doc, shell_line
 from pnu.run.groups import Data
 
 
@@ -32,7 +32,7 @@ def prepare(cfg: Any) -> None:
     for name, value in describe(path).items():
         if name != "parameters":
             print(f"{name:24s} {'-' if value is None else value if not isinstance(value, float) else f'{value:.4g}'}")
-    print(f"next: python -m pnu.train data=patches data.path={path}")
+    print(f"next: {shell_line('train', data='patches', **{'data.path': path})}")
 
 
 def copied(path: Path, output: Path) -> Path:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pnu.run import command, doc
+from pnu.run import command, doc, shell_line
 from pnu.run.progress import busy
 
 
@@ -81,7 +81,7 @@ def reconstruct(cfg: Any) -> None:
     say(f"output: {cfg.output}, {counts}, {time.perf_counter() - started:.1f} s")
     for note in notes:
         say(f"        {note}")
-    say(f"next:   python -m pnu.picture inputs=[{cfg.input},{cfg.output}] output=picture.png")
+    say(f"next:   {shell_line('picture', inputs=[cfg.input, cfg.output], output='picture.png')}")
 
 
 def check(cfg: Any) -> None:

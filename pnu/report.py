@@ -1,5 +1,6 @@
 """What the runs of a sweep say: `python -m pnu.report sweep=outputs/sweeps/<name>`."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,8 @@ def report(cfg: Any) -> None:
     print(f"{len(found.settings)} settings, {runs} finished runs, {len(found.unfinished)} unfinished")
     for run in found.unfinished:
         print(f"  {run.folder}: {study.texts.status(run)}")
-    print(f"report folder: {page.parent}\nnext: open {page} in a browser, or compare curves with make board")
+    print(f"report folder: {page.parent}")
+    print(f"next: open {page} in a browser; its curves: tensorboard --logdir {shlex.quote(str(folder))}")
 
 
 def newest() -> Path:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pnu.run import command, doc
+from pnu.run import command, doc, shell_line
 
 LONG = 500_000  # points made, from which on finished parts are kept beside the output until it is there
 
@@ -93,7 +93,7 @@ def upsample(cfg: Any) -> None:
     for note in notes:
         say(f"        {note}")
     say(f"output: {cfg.output}, {len(dense)} points with unit normals, {time.perf_counter() - started:.1f} s")
-    say(f"next:   python -m pnu.reconstruct input={cfg.output} output=mesh.ply")
+    say(f"next:   {shell_line('reconstruct', input=cfg.output, output='mesh.ply')}")
 
 
 @contextmanager

@@ -395,6 +395,11 @@ def test_an_interruption_tells_how_to_go_on(
     assert ended.value.code == 130
     assert run.read_record()["error"] == "interrupted"
     assert capsys.readouterr().err == f"stopped; go on with: python -m pnu.train resume=true run={run}\n"
+    job = RunFolder.create({**CONFIG, "run": str(tmp_path / "job")})
+    job.facts = {"job": 0}
+    with pytest.raises(SystemExit), job.recorded(CONFIG):
+        raise stop
+    assert capsys.readouterr().err == "", "the sweep tells at its end, how to go on with it"
 
 
 def test_options_may_stand_between_overrides(script: Any) -> None:

@@ -2,7 +2,10 @@
 
 import json
 import os
+import platform
 import re
+import shlex
+import signal
 import subprocess
 import sys
 import time
@@ -12,7 +15,7 @@ import pytest
 import yaml
 
 from pnu.io import read_json, write_json
-from pnu.run import compose_config
+from pnu.run import RunFolder, compose_config
 from pnu.run.config import composer, config_folder
 from pnu.run.schema import check
 from pnu.run.sweep import arguments, check_job, label_of, sweep_name
@@ -136,9 +139,9 @@ def test_the_same_command_is_the_same_sweep() -> None:
 
 
 def test_labels_are_short() -> None:
-    assert label_of("seed=0,setting=loss_terms/no_cd") == "no_cd,seed=0"
-    assert label_of("loss.w2=0.15676677195506075") == "loss.w2=0.1568"
-    assert label_of("data.path=/a/b c.h5") == "data.path=b-c.h5"
+    assert label_of("seed=0,setting=loss_terms/no_cd") == "no_cd_seed-0"
+    assert label_of("loss.w2=0.15676677195506075") == "loss.w2-0.1568"
+    assert label_of("data.path=/a/b c.h5,optimizer.lr=1e30") == "data.path-b-c.h5_optimizer.lr-1e+30"
 
 
 # --- what a job cannot be ---
@@ -259,7 +262,7 @@ def test_a_job_that_runs_is_left_alone(
     line = [*small(patch_file), "setting=default", "seed=0,1", "sweep=s"]
     main(line)
     folder = tmp_path / "outputs" / "sweeps" / "s"
-    run = next(folder.glob("seed=0*"))
+    run = next(folder.glob("seed-0*"))
     before = (run / "metrics.json").stat().st_mtime_ns
     write_json(run / "run.json", read_json(run / "run.json") | {"status": "running"})
     capsys.readouterr()
@@ -300,8 +303,63 @@ def test_a_failing_job_is_told_at_once_and_the_others_go_on(
     report(["sweep=outputs/sweeps/s"])
     assert "1 unfinished" in capsys.readouterr().out
     assert re.search(
-        r"optimizer.lr=1e\+30_\w+: failed: \w+: ", (tmp_path / "outputs/sweeps/s/report/report.md").read_text()
+        r"optimizer.lr-1e\+30_\w+: failed: \w+: ", (tmp_path / "outputs/sweeps/s/report/report.md").read_text()
     )
+
+
+# --- Ctrl-C ---
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("untraced")
+@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+@pytest.mark.parametrize("whom", ["all", "first"])
+def test_interrupted_with_a_launcher(launcher: str, whom: str, patch_file: Path, tmp_path: Path) -> None:  # noqa: F811
+    """Ctrl-C reaches all processes of a terminal, `kill -INT` the first alone: no traceback, a summary, the line to go
+    on with, exit code 130, and no job that runs for ever."""
+    line = [*small(patch_file), "seed=0,1,2", "sweep=a sweep", "trainer.max_steps=-1", "trainer.max_epochs=100000"]
+    line += ["trainer.val_check_interval=1000", "callbacks.checkpoints.every_n_steps=1"]
+    if launcher == "joblib":
+        pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+        line += ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "pnu.train", *line],
+        **{"cwd": tmp_path, "env": {**os.environ, "OMP_NUM_THREADS": "1"}, "text": True, "start_new_session": True},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    folder = tmp_path / "outputs" / "sweeps" / "a sweep"
+    jobs = 2 if launcher == "joblib" else 1
+    while len(list(folder.glob("*/checkpoints/last.ckpt"))) < jobs and process.poll() is None:
+        time.sleep(0.05)
+    (os.killpg if whom == "all" else os.kill)(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 130
+    assert out == (
+        f"\nsweep folder: outputs/sweeps/a sweep ({jobs} interrupted)\nnext: python -m pnu.train {shlex.join(line)}\n"
+    )
+    assert err == f"stopped; go on with: python -m pnu.train {shlex.join(line)}\n"
+    found = records(folder).values()
+    assert [(record["status"], record["error"]) for record in found] == [("failed", "interrupted")] * jobs
+
+
+def test_a_job_whose_process_is_gone_does_not_run(tmp_path: Path) -> None:
+    from pnu.run.sweep import closing, locked, record_interruptions, state
+
+    run = RunFolder(tmp_path / "default_1")
+    run.path.mkdir()
+    write_json(run.record_path, {"status": "running", "host": platform.node()})
+    lock = locked(run.path)
+    assert state(run) == "running"
+    record_interruptions(tmp_path, patience=0)
+    assert run.read_record()["status"] == "running"
+    os.close(lock)
+    assert state(run) == "interrupted"
+    assert "(1 interrupted)" in closing(tmp_path)
+    record_interruptions(tmp_path)
+    assert (run.read_record()["status"], run.read_record()["error"]) == ("failed", "interrupted")
+    write_json(run.record_path, {"status": "running", "host": "elsewhere"})
+    assert state(run) == "running"
 
 
 # --- launchers and searches ---

@@ -83,6 +83,32 @@ def events(run: Path) -> EventAccumulator:
 # --- the run folder ---
 
 
+def test_hydras_folder_is_the_run_folder(train: Train, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    small = yaml.safe_load((train("trainer.max_steps=1") / "config.yaml").read_text())["data"]
+    line = ["data=patches", *(f"data.{key}={small[key]}" for key in ("path", "input_points", "target_points"))]
+    line += ["trainer.accelerator=cpu", "trainer.max_steps=1", "quiet=true", "callbacks.pictures.clouds=0"]
+    main([*line, 'hydra.run.dir="a, b/${now:%Y}/${name}"'])
+    (run,) = tmp_path.glob("a, b/2*/train")
+    assert capsys.readouterr().out.splitlines()[-1] == str(run.relative_to(tmp_path))
+    assert record(run)["status"] == "finished"
+    assert (run / "checkpoints/last.ckpt").exists()
+    assert not (tmp_path / "outputs").exists()
+    main([*line, "hydra.run.dir=same", f"run={tmp_path}/same"])
+    assert record(tmp_path / "same")["status"] == "finished"
+    error = refused(capsys, main, [*line, "hydra.run.dir=one", "run=two"])
+    assert error == "error: run=two and hydra.run.dir=one: are two folders; give one of them"
+    assert not (tmp_path / "one").exists()
+    assert not (tmp_path / "two").exists()
+
+
+def test_hydras_folder_is_none_of_other_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from pnu.upsample import main as upsample
+
+    error = refused(capsys, upsample, ["input=a.ply", "output=b.ply", f"hydra.run.dir={tmp_path}/x"])
+    assert "this command makes no run folder; its files are named by its keys" in error
+    assert not (tmp_path / "x").exists()
+
+
 @pytest.fixture(scope="module")
 def finished(patch_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = tmp_path_factory.mktemp("finished") / "run"

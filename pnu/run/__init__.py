@@ -35,6 +35,7 @@ from pnu.run.build import build
 from pnu.run.command import command
 from pnu.run.config import compose_config
 from pnu.run.folder import RunFolder, is_main_process
+from pnu.run.quoting import shell_line
 from pnu.run.resume import open_run
 from pnu.run.schema import doc
 from pnu.run.table import closing, job_line, objective
@@ -50,4 +51,5 @@ __all__ = [
     "job_line",
     "objective",
     "open_run",
+    "shell_line",
 ]

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from pnu import __version__
-from pnu.run import search, sweep
+from pnu.run import quoting, search, sweep
 from pnu.run.config import check_keys, check_single, composer, config_folder, in_multirun, one_line, variations
+from pnu.run.folder import INTERRUPTED, is_main_process
 from pnu.run.help import help_text
 from pnu.run.schema import check, fields
 
@@ -49,7 +50,6 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
             return
         # before torch is there: on a busy machine, threads that spin while they wait make a step take seconds
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-        program = f"python -m pnu.{name}" if sys.argv[0].endswith(".py") else Path(sys.argv[0]).name
         import hydra
         from hydra._internal.utils import get_args_parser
 
@@ -59,7 +59,7 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
         try:
             with composer(name, parsed.config_dir) as compose:
                 if parsed.help:
-                    print(help_text(schema, program, check(compose(overrides), schema, complete=False)))
+                    print(help_text(schema, quoting.program(name), check(compose(overrides), schema, complete=False)))
                     return
                 if not parsed.multirun:
                     check_single(overrides)
@@ -78,24 +78,53 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
                     if goes_on:
                         sweep.check_job(config)
                 if goes_on:
-                    own = [o for o in parsed.overrides if o.startswith("hydra.")]
-                    hydra_config = compose([*next(variations(overrides)), *own], True).hydra
+                    hydra_config = compose([*next(variations(overrides)), *hydras_own(parsed.overrides)], True).hydra
                     Path(hydra_config.sweep.dir).mkdir(parents=True, exist_ok=True)
                     arguments += search.arguments(hydra_config)
+                elif not parsed.multirun and not parsed.cfg:
+                    arguments += folder_arguments(compose([*overrides, *hydras_own(parsed.overrides)], True), schema)
         except (ValueError, OSError) as error:
             if full_errors():
                 raise
             stop(error)
         start = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=name)(task)
-        with replaced_argv(arguments):
-            if not goes_on or parsed.cfg:
-                start()
-            else:
-                sweep.run(start, Path(hydra_config.sweep.dir))
+        with replaced_argv(arguments), quoting.typed(name, given):
+            try:
+                if not goes_on or parsed.cfg:
+                    start()
+                else:
+                    sweep.run(start, Path(hydra_config.sweep.dir))
+            except KeyboardInterrupt:
+                print(f"stopped; start again with: {quoting.typed_line()}", file=sys.stderr)
+                sys.exit(INTERRUPTED)
 
     main.schema = schema  # type: ignore[attr-defined]
     main.__doc__ = schema.__doc__
     return main
+
+
+def hydras_own(overrides: Sequence[str]) -> list[str]:
+    return [override for override in overrides if override.startswith("hydra.")]
+
+
+def folder_arguments(config: Any, schema: type) -> list[str]:
+    """Hydra's `hydra.run.dir` as our `run`, wherever it is set.
+
+    Raises:
+        ValueError: `run` names another folder, or the command makes none.
+    """
+    given, changes = config.hydra.run.dir, config.hydra.job.chdir
+    if given == "." or not is_main_process():  # Lightning gives the other processes of a training one of their own
+        return []
+    if "trainer" not in fields(schema):
+        if changes:
+            return []
+        raise ValueError(f"hydra.run.dir={given}: this command makes no run folder; its files are named by its keys")
+    if config.run is None:
+        return [quoting.override("run", Path(given).absolute() if changes else given)]
+    if Path(config.run).absolute() != Path(given).absolute():
+        raise ValueError(f"run={config.run} and hydra.run.dir={given}: are two folders; give one of them")
+    return []
 
 
 def is_override(argument: str) -> bool:

@@ -6,6 +6,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from pnu.run.quoting import quoted
 from pnu.run.schema import check, known_keys, nearest_key
 
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -72,7 +73,7 @@ def parse(overrides: list[str]) -> list[Any]:
             parsed += parser.parse_overrides([override])
         except HydraException:
             key, equals, value = override.partition("=")
-            hint = f"special characters want quotes, '{key}=\"{value}\"'" if equals else "expected key=value"
+            hint = f"special characters want quotes, {quoted(key, value)}" if equals else "expected key=value"
             raise ValueError(f"cannot read {override!r}: {hint}") from None
     return parsed
 
@@ -106,7 +107,7 @@ def check_single(overrides: list[str]) -> None:
         if override.is_sweep_override():
             key, _, value = raw.partition("=")
             raise ValueError(
-                f"{raw}: for one run with each value, add -m; a comma in a value wants quotes, '{key}=\"{value}\"'"
+                f"{raw}: for one run with each value, add -m; a comma in a value wants quotes, {quoted(key, value)}"
             )
 
 

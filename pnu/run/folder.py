@@ -6,7 +6,6 @@ import importlib.metadata
 import json
 import os
 import platform
-import shlex
 import subprocess
 import sys
 import time
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from pnu.io import atomic_path, read_json, write_json
+from pnu.run.quoting import shell_line, typed_line
 
 INTERRUPTED = 130  # exit code of a program that Ctrl-C ends
 PACKAGES = ("pnu", "torch", "lightning", "numpy", "scipy", "hydra-core")
@@ -107,7 +107,7 @@ class RunFolder:
         before = self.read_record()
         record = {
             "status": "running",
-            "command": shlex.join([Path(sys.executable).name, *sys.orig_argv[1:]]),
+            "command": typed_line(),
             "started": before.get("started", now()),
             "resumed": [*before.get("resumed", []), *([now()] if before else [])],
             "pid": os.getpid(),
@@ -127,7 +127,8 @@ class RunFolder:
             record["status"] = "finished"
         except (KeyboardInterrupt, SystemExit):  # Lightning turns the first into the second
             record |= {"status": "failed", "error": "interrupted"}
-            print(f"stopped; go on with: python -m pnu.train resume=true run={self}", file=sys.stderr)
+            if "job" not in self.facts:  # a sweep tells at its end
+                print(f"stopped; go on with: {shell_line('train', resume=True, run=self)}", file=sys.stderr)
             sys.exit(INTERRUPTED)
         except BaseException as error:
             record |= {"status": "failed", "error": f"{type(error).__name__}: {' '.join(str(error).split())}"}

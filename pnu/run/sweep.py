@@ -9,6 +9,7 @@ from its last checkpoint, or starts again where it has none.
 
 import hashlib
 import os
+import platform
 import re
 import shutil
 import sys
@@ -18,9 +19,10 @@ from contextlib import redirect_stderr
 from pathlib import Path
 from typing import Any, TextIO, cast
 
-from pnu.io import read_json, remove_leftovers
+from pnu.io import read_json, remove_leftovers, write_json
 from pnu.run.config import one_line, parse, variations
-from pnu.run.folder import RunFolder, config_hash
+from pnu.run.folder import INTERRUPTED, RunFolder, config_hash, now
+from pnu.run.quoting import shell_line, typed_line
 
 UNNAMED = ("sweep", "quiet")  # keys that do not make another sweep
 
@@ -99,7 +101,8 @@ def job_folder(config: Mapping[str, Any]) -> RunFolder:
 
 
 def label_of(overrides: str) -> str:
-    """A short name of what sets a job apart: "seed=0,setting=loss_terms/no_cd" becomes "no_cd,seed=0"."""
+    """A short name of what sets a job apart: "seed=0,setting=loss_terms/no_cd" becomes "no_cd_seed-0"; no sign in it
+    wants quotes."""
     parts = []
     for part in filter(None, overrides.split(",")):
         key, _, value = part.partition("=")
@@ -107,9 +110,9 @@ def label_of(overrides: str) -> str:
             value = f"{float(value):.4g}"
         except ValueError:
             value = value.rpartition("/")[2]
-        parts.append(value if key == "setting" else f"{key}={value}")
-    parts.sort(key=lambda part: "=" in part)
-    return re.sub(r"[^\w.,=+-]", "-", ",".join(parts))[:100]
+        parts.append((key != "setting", value if key == "setting" else f"{key}-{value}"))
+    named = "_".join(part for _, part in sorted(parts, key=lambda part: part[0]))
+    return re.sub(r"[^\w.+-]", "-", named, flags=re.ASCII)[:100]
 
 
 def locked(path: Path) -> int:
@@ -154,19 +157,47 @@ def failed(error: Exception) -> Exception:
 
 
 def run(start: Callable[[], None], folder: Path) -> None:
-    """Start a sweep; at its end tell how its jobs ended. Exit code 1 if any failed."""
+    """Start a sweep; at its end tell how its jobs ended. Exit code 1 if any failed, 130 after Ctrl-C."""
     began = time.time() - 1
+    code: Any = 0
     try:
         with redirect_stderr(cast(TextIO, WithoutEcho(sys.stderr))):
             start()
-    except SystemExit:
-        print(closing(folder), flush=True)
-        raise
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+    except SystemExit as stop:
+        code = stop.code
+    if code == INTERRUPTED:
+        record_interruptions(folder)
     print(closing(folder), flush=True)
+    if code == INTERRUPTED:
+        print(f"stopped; go on with: {typed_line()}", file=sys.stderr, flush=True)
     ended = [run for run in runs(folder) if run.record_path.stat().st_mtime > began]
     broken = [run for run in ended if run.read_record().get("status") != "finished" and not runs_elsewhere(run)]
-    if broken:  # Optuna goes on without them
-        sys.exit(1)
+    if code or broken:  # Optuna goes on without them
+        sys.exit(code or 1)
+
+
+def record_interruptions(folder: Path, patience: float = 10) -> None:
+    """Say so in the records of jobs whose processes Ctrl-C has ended before they could."""
+    deadline = time.monotonic() + patience  # a launcher's processes may still be ending
+    while any(state(run) == "running" for run in runs(folder)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    for run in runs(folder):
+        record = run.read_record()
+        if record.get("status") == "running" and state(run) == "interrupted":
+            write_json(run.record_path, record | {"status": "failed", "error": "interrupted", "ended": now()})
+
+
+def state(run: RunFolder) -> str:
+    """How a run's record ends: finished, failed, interrupted, running; "interrupted" too where the process of a record
+    that says "running" is gone."""
+    record = run.read_record()
+    status = str(record.get("status", "no record"))
+    if record.get("error") == "interrupted":
+        return "interrupted"
+    gone = status == "running" and record.get("host") == platform.node() and not runs_elsewhere(run)
+    return "interrupted" if gone else status
 
 
 class WithoutEcho:
@@ -192,6 +223,7 @@ def runs(sweep: Path) -> list[RunFolder]:
 
 def closing(sweep: Path) -> str:
     """What a sweep prints at its end."""
-    states = [run.read_record().get("status") for run in runs(sweep)]
+    states = [state(run) for run in runs(sweep)]
     counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
-    return f"\nsweep folder: {sweep} ({counts})\nnext: python -m pnu.report sweep={sweep}"
+    again = typed_line() if "finished" not in states else shell_line("report", sweep=sweep)
+    return f"\nsweep folder: {sweep} ({counts})\nnext: {again}"

@@ -5,6 +5,7 @@ from typing import Any
 
 from pnu.io import read_json
 from pnu.run.folder import RunFolder
+from pnu.run.quoting import shell_line
 
 # metric -> how a table shows it: name, factor, format
 SHOWN = {
@@ -57,5 +58,5 @@ def closing(run: RunFolder) -> str:
         for row in rows
     ]
     lines.insert(1, "-" * len(lines[0]))
-    upsample = f"python -m pnu.upsample input=cloud.ply output=dense.ply run={run}"
+    upsample = shell_line("upsample", input="cloud.ply", output="dense.ply", run=run)
     return "\n".join(["", *lines, "", f"run folder: {run}", f"next: {upsample}"])

@@ -11,6 +11,7 @@ import yaml
 from pnu.io import read_json
 from pnu.run.config import flatten
 from pnu.run.folder import UNHASHED, UNHASHED_DATA, RunFolder
+from pnu.run.quoting import shell_line
 from pnu.run.sweep import runs
 from pnu.run.table import SHOWN
 
@@ -102,7 +103,9 @@ def collect(folder: str | Path, baseline: str | None = None) -> Study:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise ValueError(f"sweep={folder}: no such folder; expected one that a sweep (python -m pnu.train -m) made")
+        raise ValueError(
+            f"sweep={folder}: no such folder; expected one that a sweep made ({shell_line('train', '-m')} ...)"
+        )
     found = [read(run) for run in runs(folder)]
     finished = [run for run in found if run.metrics]
     if not finished:

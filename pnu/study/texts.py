@@ -13,6 +13,7 @@ from PIL import Image
 
 from pnu import page
 from pnu.io import atomic_path
+from pnu.run.quoting import retyped
 from pnu.run.table import SHOWN
 from pnu.study.pictures import sheets
 from pnu.study.plots import plots
@@ -69,8 +70,7 @@ def facts(study: Study) -> list[str]:
 
 
 def command_of(study: Study) -> str:
-    command = str(study.baseline.runs[0].record.get("command", ""))
-    return command.partition("-m pnu.train")[1] and "python -m pnu.train" + command.partition("-m pnu.train")[2]
+    return retyped(str(study.baseline.runs[0].record.get("command", "")))
 
 
 def head(metric: str) -> str:
