@@ -86,7 +86,7 @@ def reconstruct(cfg: Any) -> None:
 
 def check(cfg: Any) -> None:
     """Refuse what can be refused before the work begins."""
-    from pnu.io import MESH_SUFFIXES, check_writable
+    from pnu.io import MESH_OUTPUTS, check_writable
     from pnu.ops.colors import COLORMAPS
 
     if cfg.normals not in ("auto", "estimate"):
@@ -97,8 +97,8 @@ def check(cfg: Any) -> None:
         raise ValueError(f"trim={cfg.trim:g}: expected a share of the vertices from 0 to below 1, such as 0.05")
     if cfg.limit is not None and not cfg.limit > 0:
         raise ValueError(f"limit={cfg.limit:g}: expected a distance above 0")
-    if Path(cfg.output).suffix.lower() not in MESH_SUFFIXES:
-        raise ValueError(f"output={cfg.output}: expected a mesh, one of {', '.join(sorted(MESH_SUFFIXES))}")
+    if Path(cfg.output).suffix.lower() not in MESH_OUTPUTS:
+        raise ValueError(f"output={cfg.output}: expected a mesh, one of {', '.join(sorted(MESH_OUTPUTS))}")
     if Path(cfg.output).resolve() == Path(cfg.input).resolve():
         raise ValueError(f"output={cfg.output}: is the input; give another name")
     check_writable(cfg.output)

@@ -11,9 +11,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from pnu.run import command, doc, shell_line
+
+if TYPE_CHECKING:
+    from pnu.io import Cloud
 
 LONG = 500_000  # points made, from which on finished parts are kept beside the output until it is there
 
@@ -23,11 +26,12 @@ class Upsample:
     """Densify a point cloud file with a trained network; `model=NAME` is `run=NAME`."""
 
     also: ClassVar = {"model": "run"}
-    input: str = doc("file to read: ply, xyz, txt, pcd, obj, off, npy, las or laz")
+    input: str = doc("file to read: ply, xyz, txt, pcd, obj, off, npy, las, laz, stl, glb, gltf, vtk, vtp or e57")
     output: str = doc("file to write; its suffix says the format")
     run: str = doc("run folder, or weights that come with pnu: surface, pnu ...; newest: the run that finished last")
     ratio: float = doc("points out for each point in, any number >= 1")
     normals: str = doc("auto: the file's, estimated where it has none; estimate: always estimated")
+    sample: int | None = doc("of a mesh: as many points on its faces, with their normals; null: its vertices")
     patch_size: int | None = doc("points of a patch, at least 16; null: what the network was made for")
     batch_size: int | None = doc("patches (surface: points) at once, bounds the memory; null: by the device")
     device: str = doc("auto, cpu, cuda, cuda:1 ...")
@@ -48,7 +52,10 @@ def upsample(cfg: Any) -> None:
     io.check_output(cfg.output)
     if Path(cfg.output).resolve() == Path(cfg.input).resolve():
         raise ValueError(f"output={cfg.output}: is the input; give another name")
-    cloud = io.read_cloud(cfg.input, normals=cfg.normals == "auto")
+    if cfg.sample is None:
+        cloud = io.read_cloud(cfg.input, normals=cfg.normals == "auto")
+    else:
+        cloud = sampled(cfg.input, cfg.sample, cfg.normals == "auto", cfg.seed)
     origin = "with normals" if cloud.normals is not None else "normals estimated and oriented"
     say(f"input:  {cfg.input}, {len(cloud.points)} points, {origin}")
     for note in cloud.notes:
@@ -94,6 +101,26 @@ def upsample(cfg: Any) -> None:
         say(f"        {note}")
     say(f"output: {cfg.output}, {len(dense)} points with unit normals, {time.perf_counter() - started:.1f} s")
     say(f"next:   {shell_line('reconstruct', input=cfg.output, output='mesh.ply')}")
+
+
+def sampled(path: str, count: int, normals: bool, seed: int) -> "Cloud":
+    """So many points spread evenly over the faces of a mesh, with their normals."""
+    import numpy as np
+
+    from pnu import io
+    from pnu.ops.surface import sample_poisson_disk
+
+    if count < 16:
+        raise ValueError(f"sample={count}: expected at least 16 points, such as 5000")
+    if Path(path).suffix.lower() not in io.MESH_SUFFIXES:
+        raise ValueError(f"sample={count}: {path} is no mesh; leave sample=null")
+    mesh = io.read_mesh(path)
+    try:
+        points = sample_poisson_disk(mesh, count, np.random.default_rng(seed))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    note = f"a mesh: the points are on its {len(mesh.faces)} faces, not its {len(mesh.vertices)} vertices"
+    return io.Cloud(points[:, :3], points[:, 3:] if normals else None, {}, (note,))
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pnu.io import (
-    MESH_SUFFIXES,
+    MESH_OUTPUTS,
     OUTPUT_SUFFIXES,
     Mesh,
     atomic_path,
@@ -125,7 +125,7 @@ def test_other_programs_read_our_files(tmp_path: Path, cloud: tuple[Array, Array
     read = trimesh.load(tmp_path / "c.ply")
     np.testing.assert_allclose(read.vertices, cloud[0], atol=1e-6)
     assert read.colors[0].tolist() == [7, 7, 7, 255]
-    for suffix in sorted(MESH_SUFFIXES):
+    for suffix in sorted(MESH_OUTPUTS):
         write_mesh(tmp_path / f"m{suffix}", CUBE)
         assert trimesh.load(tmp_path / f"m{suffix}").volume == pytest.approx(1)
         trimesh.load(tmp_path / f"m{suffix}").export(tmp_path / f"t{suffix}")
@@ -327,7 +327,7 @@ def test_open3d_reads_our_pcd_and_ply(tmp_path: Path, cloud: tuple[Array, Array]
 # Meshes
 
 
-@pytest.mark.parametrize("suffix", sorted(MESH_SUFFIXES))
+@pytest.mark.parametrize("suffix", sorted(MESH_OUTPUTS))
 def test_mesh_round_trip(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"m{suffix}"
     write_mesh(path, CUBE)

@@ -3,11 +3,12 @@
 from pnu.io.atomic import atomic_path, check_writable, read_json, remove_leftovers, write_json
 from pnu.io.cloud import CLOUD_SUFFIXES, Cloud, check_cloud, read_cloud
 from pnu.io.folder import files_of, meshes_of
-from pnu.io.mesh import MESH_SUFFIXES, Mesh, read_mesh, write_mesh
+from pnu.io.mesh import MESH_OUTPUTS, MESH_SUFFIXES, Mesh, read_mesh, write_mesh
 from pnu.io.output import OUTPUT_SUFFIXES, check_output, kept_attributes, write_cloud
 
 __all__ = [
     "CLOUD_SUFFIXES",
+    "MESH_OUTPUTS",
     "MESH_SUFFIXES",
     "OUTPUT_SUFFIXES",
     "Cloud",

@@ -8,9 +8,9 @@ import numpy as np
 
 from pnu.io.fields import arranged, as_colors
 from pnu.io.las import read_las
-from pnu.io.mesh import Geometry, read_obj, read_off
+from pnu.io.mesh import Geometry, read_gltf_mesh, read_obj, read_off, read_stl
 from pnu.io.pcd import read_pcd
-from pnu.io.ply import read_ply
+from pnu.io.ply import element_sizes, read_ply
 from pnu.io.text import open_file, table, text_lines
 
 LARGEST = 1e30  # beyond, squared distances leave the range of float64 or what float32 can hold after scaling
@@ -178,7 +178,15 @@ def _from_table(path: Path, values: np.ndarray) -> Cloud:
 
 def _read_ply(path: Path) -> Cloud:
     columns = {name: v for name, v in read_ply(path, {"vertex"}).get("vertex", {}).items() if isinstance(v, np.ndarray)}
-    return _from_columns(path, columns)
+    return _without_faces(_from_columns(path, columns), element_sizes(path).get("face", 0))
+
+
+def _without_faces(cloud: Cloud, faces: int) -> Cloud:
+    """A cloud that was read from a file with faces, which says so."""
+    note = (
+        f"a mesh: its vertices are the points, its {faces} faces are ignored (pnu.upsample samples them: sample=5000)"
+    )
+    return cloud._replace(notes=(*cloud.notes, note)) if faces else cloud
 
 
 def _read_pcd(path: Path) -> Cloud:
@@ -206,10 +214,8 @@ def _read_las(path: Path) -> Cloud:
 
 def _from_geometry(read: Callable[[Path], Geometry]) -> Callable[[Path], Cloud]:
     def cloud(path: Path) -> Cloud:
-        geometry = read(path)
-        return Cloud(
-            geometry.vertices, geometry.normals, {} if geometry.colors is None else {"colors": geometry.colors}
-        )
+        vertices, faces, normals, colors = read(path)
+        return _without_faces(Cloud(vertices, normals, {} if colors is None else {"colors": colors}), len(faces))
 
     return cloud
 
@@ -221,6 +227,9 @@ READERS: dict[str, Callable[[Path], Cloud]] = {
     ".pcd": _read_pcd,
     ".obj": _from_geometry(read_obj),
     ".off": _from_geometry(read_off),
+    ".stl": _from_geometry(read_stl),
+    ".glb": _from_geometry(read_gltf_mesh),
+    ".gltf": _from_geometry(read_gltf_mesh),
     ".npy": _read_npy,
     ".las": _read_las,
     ".laz": _read_las,

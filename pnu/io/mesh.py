@@ -1,4 +1,4 @@
-"""Triangle meshes: ply, off, obj, stl."""
+"""Triangle meshes: ply, off, obj, stl; glb, gltf and vtk are read only."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -8,6 +8,7 @@ import numpy as np
 
 from pnu.io.atomic import atomic_path
 from pnu.io.fields import NORMAL, XYZ, arranged, as_colors
+from pnu.io.gltf import read_gltf
 from pnu.io.ply import Lists, read_ply, write_ply
 from pnu.io.polygons import triangulate
 from pnu.io.shift import read_shift, shifted, single_is_enough
@@ -71,7 +72,7 @@ def write_mesh(
     first two; stl none. stl, which knows single precision only, names a shift where coordinates need one.
     """
     path = Path(path)
-    suffix = known_suffix(path, "mesh", MESH_SUFFIXES)
+    suffix = known_suffix(path, "mesh to write", MESH_OUTPUTS)
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     if colors is not None and np.issubdtype(np.asarray(colors).dtype, np.floating):
         colors = np.rint(np.clip(colors, 0, 1) * 255)
@@ -228,7 +229,7 @@ def read_off(path: Path) -> Geometry:
     return Geometry(values[:, :3], faces, values[:, 3:6] if "N" in head else None, colors)
 
 
-def _read_stl(path: Path) -> Geometry:
+def read_stl(path: Path) -> Geometry:
     data = path.read_bytes()
     count = int.from_bytes(data[80:84], "little")
     if len(data) >= 84 and len(data) == 84 + 50 * count:
@@ -251,6 +252,11 @@ def _read_stl(path: Path) -> Geometry:
         )
     vertices, index = np.unique(corners, axis=0, return_inverse=True)  # stl repeats each vertex in each triangle
     return Geometry(vertices, index.reshape(-1, 3).astype(np.int64))
+
+
+def read_gltf_mesh(path: Path) -> Geometry:
+    vertices, faces, colors = read_gltf(path)
+    return Geometry(vertices, faces, None, colors)
 
 
 def write_obj(path: Path, geometry: Geometry) -> None:
@@ -295,6 +301,9 @@ READERS: dict[str, Callable[[Path], Geometry]] = {
     ".ply": _read_ply,
     ".obj": read_obj,
     ".off": read_off,
-    ".stl": _read_stl,
+    ".stl": read_stl,
+    ".glb": read_gltf_mesh,
+    ".gltf": read_gltf_mesh,
 }
 MESH_SUFFIXES = frozenset(READERS)
+MESH_OUTPUTS = frozenset({".ply", ".obj", ".off", ".stl"})
