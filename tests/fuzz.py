@@ -170,6 +170,31 @@ def mesh_files(suffix: str) -> Callable[[], list[bytes]]:
     return examples
 
 
+def gltf_examples() -> list[bytes]:
+    import trimesh
+
+    box, sphere = trimesh.creation.box(), trimesh.creation.icosphere(1)
+    return [shape.scene().export(file_type="glb") for shape in (box, sphere)]
+
+
+def vtk_examples() -> list[bytes]:
+    from tests.test_scanner_formats import legacy
+
+    return [legacy(binary, version) for binary in (False, True) for version in (3, 5)]
+
+
+def vtp_examples() -> list[bytes]:
+    from tests.test_scanner_formats import xml
+
+    return [xml(form, packed) for form in ("ascii", "binary", "appended raw") for packed in (False, True)]
+
+
+def e57_examples() -> list[bytes]:
+    from tests.test_scanner_formats import e57, scan, sphere
+
+    return [written(".e57", lambda path: e57(path, [scan(sphere(), None)], np.zeros(3)))]
+
+
 def patch_files() -> list[bytes]:
     import h5py
 
@@ -349,6 +374,87 @@ def stl_files(draw: st.DrawFn) -> bytes:
 
 
 @st.composite
+def gltf_files(draw: st.DrawFn) -> bytes:
+    """A tree whose counts, types and references may lie, between the two parts of glb."""
+    number = st.sampled_from([0, 1, 3, 8, 36, 96, -1, 10**9, 2**63])
+    index = st.sampled_from([0, 0, 0, 1, 2, -1, 99])
+    kinds = st.sampled_from([5126, 5126, 5123, 5125, 5121, 7])
+    view = st.fixed_dictionaries({"buffer": index, "byteLength": number}, optional={"byteOffset": number})
+    accessor = st.fixed_dictionaries(
+        {
+            "componentType": kinds,
+            "count": number,
+            "type": st.sampled_from(["VEC3", "VEC3", "SCALAR", "MAT4", "x"]),
+        },
+        optional={"bufferView": index, "byteOffset": number, "sparse": st.just({"count": 10**9})},
+    )
+    attributes = st.fixed_dictionaries({"POSITION": index}, optional={"COLOR_0": index, "NORMAL": index})
+    primitive = st.fixed_dictionaries({"attributes": attributes}, optional={"indices": index, "mode": index})
+    node = st.fixed_dictionaries(
+        {"mesh": index}, optional={"children": st.lists(index, max_size=2), "scale": st.lists(number, max_size=4)}
+    )
+    tree = {
+        "asset": {"version": "2.0"},
+        "scene": draw(index),
+        "scenes": [{"nodes": draw(st.lists(index, max_size=3))}],
+        "nodes": draw(st.lists(node, max_size=3)),
+        "meshes": [{"primitives": draw(st.lists(primitive, max_size=2))}],
+        "accessors": draw(st.lists(accessor, max_size=3)),
+        "bufferViews": draw(st.lists(view, max_size=3)),
+        "buffers": [{"byteLength": draw(number)}],
+    }
+    text = draw(st.sampled_from([json.dumps(tree), json.dumps(tree)[:-1], "[]", "{", "[" * 9000])).encode()
+    length = draw(st.sampled_from([len(text), len(text), 0, 2**31]))
+    rest = draw(junk)
+    head = b"glTF" + struct.pack("<III", 2, 28 + len(text) + len(rest), length) + b"JSON"
+    return head + text + struct.pack("<I", draw(st.sampled_from([len(rest), 0, 2**32 - 1]))) + b"BIN\0" + rest
+
+
+@st.composite
+def vtk_files(draw: st.DrawFn) -> bytes:
+    kind = st.sampled_from(["float", "double", "int", "vtktypeint64", "bit", "x"])
+    row = st.builds("POINTS {} {}".format, count, kind) | st.builds("POLYGONS {} {}".format, count, count)
+    row |= st.builds("OFFSETS {}".format, kind) | st.builds("POINT_DATA {}".format, count)
+    row |= st.builds("SCALARS a {} {}".format, kind, count) | st.builds("FIELD f {}".format, count)
+    row |= st.builds("NORMALS a {}".format, kind) | st.builds("a {} {} {}".format, count, count, kind) | lines
+    form = draw(st.sampled_from(["ASCII", "BINARY", ""]))
+    head = f"# vtk DataFile Version 3.0\nx\n{form}\nDATASET {draw(st.sampled_from(['POLYDATA', 'x', '']))}\n"
+    good = draw(
+        st.sampled_from(["", "POINTS 16 float\n" + "\n".join(f"{i} {i % 3} {i % 5}" for i in range(16)) + "\n"])
+    )
+    return (head + good + "\n".join(draw(st.lists(row, max_size=8)))).encode() + draw(junk)
+
+
+@st.composite
+def vtp_files(draw: st.DrawFn) -> bytes:
+    kind = st.sampled_from(["Float32", "Float64", "Int32", "Int64", "String", "UInt8"])
+    form = st.sampled_from(["ascii", "binary", "appended", ""])
+
+    def array(name: str) -> str:
+        text = draw(body).hex() if draw(st.booleans()) else draw(lines | square)
+        head = f"<DataArray type='{draw(kind)}' Name='{name}' format='{draw(form)}' offset='{draw(count)}'"
+        return f"{head} NumberOfComponents='{draw(count)}'>{text}</DataArray>"
+
+    packed = draw(
+        st.sampled_from(["", " compressor='vtkZLibDataCompressor'", " header_type='UInt64'", " compressor='x'"])
+    )
+    text = f"<VTKFile type='PolyData'{packed}><PolyData><Piece><Points>{array('Points')}</Points>"
+    text += f"<PointData>{array('Normals')}</PointData><Polys>{array('connectivity')}{array('offsets')}</Polys>"
+    text += "</Piece></PolyData>" + draw(st.sampled_from(["", '<AppendedData encoding="raw">_']))
+    bomb = "<!DOCTYPE a [<!ENTITY b 'bbbbbbbbbb'><!ENTITY c '&b;&b;&b;&b;'>]><VTKFile type='PolyData'>&c;</VTKFile>"
+    end = draw(st.sampled_from([b"</VTKFile>", b"</AppendedData></VTKFile>"]))
+    return draw(st.sampled_from([text.encode() + draw(body) + end, text.encode() + end, bomb.encode()]))
+
+
+@st.composite
+def e57_files(draw: st.DrawFn) -> bytes:
+    """A header whose lengths may lie, a page."""
+    far = st.sampled_from([48, 1024, 0, 2**40, 2**63])
+    head = b"ASTM-E57" + struct.pack("<IIQQQQ", draw(st.integers(0, 2)), 0, *(draw(far) for _ in range(4)))
+    return head + draw(junk).ljust(976, b"\0")
+
+
+@st.composite
 def las_files(draw: st.DrawFn) -> bytes:
     """A header whose sizes and counts may lie, records of the kinds that a reader interprets, points."""
     form, length = draw(st.sampled_from([(0, 20), (6, 30), (7, 36), (3, 34), (128, 20), (134, 30), (10, 67), (63, 1)]))
@@ -467,6 +573,11 @@ READERS = {
     "obj mesh": of_meshes(".obj", obj_files()),
     "off mesh": of_meshes(".off", off_files()),
     "stl": of_meshes(".stl", stl_files()),
+    "stl cloud": Reader(".stl", read_cloud, mesh_files(".stl"), stl_files()),
+    "glb": Reader(".glb", read_mesh, gltf_examples, gltf_files()),
+    "vtk": Reader(".vtk", read_mesh, vtk_examples, vtk_files()),
+    "vtp": Reader(".vtp", read_mesh, vtp_examples, vtp_files()),
+    "e57": Reader(".e57", read_cloud, e57_examples, e57_files()),
     "h5": Reader(".h5", read_patches, patch_files, h5_files()),
     "checkpoint": Reader(".ckpt", read_checkpoint, checkpoint_files, torch_files()),
     "safetensors": Reader(".safetensors", read_weights, weight_files, safetensors_files()),

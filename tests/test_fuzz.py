@@ -17,14 +17,14 @@ def check(results: list[dict], readers: int, cases: int) -> None:
 
 @pytest.mark.usefixtures("untraced")
 def test_a_few_cases_of_every_reader(tmp_path: Path) -> None:
-    readers = [name for name in READERS if name != "laz"]  # which takes a process a case
-    check(fuzz(readers, 12, 7, tmp_path), len(readers), 12)  # 180 in all
+    readers = [name for name in READERS if name not in ("laz", "e57")]  # which take a process a case
+    check(fuzz(readers, 12, 7, tmp_path), len(readers), 12)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", READERS)
 def test_thousands_of_cases(name: str, tmp_path: Path) -> None:
-    """800 for each reader, 12800 in all."""
+    """800 for each reader."""
     check(fuzz([name], 800, 0, tmp_path), 1, 800)
 
 

@@ -26,7 +26,7 @@ XYZ_PCD = b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\n"
 ROWS = "\n".join(f"{i} {i % 4} {i % 5}" for i in range(20))
 BAD_CLOUDS = {
     "empty.xyz": (b"", "the file is empty; expected a point cloud"),
-    "suffix.foo": (b"1", r"suffix '.foo' is not a format of a point cloud; use one of .glb .gltf .las"),
+    "suffix.foo": (b"1", r"suffix '.foo' is not a format of a point cloud; use one of .e57 .glb"),
     "plain": (b"1", "no suffix is not a format of a point cloud"),
     "words.xyz": (ROWS.replace("7 3 2", "seven 3 2").encode(), "line 8: expected numbers, found 'seven'"),
     "header.txt": (f"x,y,z\n{ROWS}".encode(), "line 1: expected numbers, found 'x'; remove or comment"),
@@ -143,7 +143,7 @@ BAD_MESHES = {
     "nan.obj": (b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "1 of 3 vertices hold NaN"),
     "cut.stl": (b"stl".ljust(80) + b"\x02\0\0\0" + b"\0" * 50, "184 bytes for the 2 triangles promised, found 134"),
     "counts.off": (b"OFF\nmany 1 0\n", "expected the numbers of vertices and faces, found 'many 1 0'"),
-    "m.dae": (b"<xml>", "the suffix '.dae' is not a format of a mesh; use one of .glb .gltf .obj .off .ply .stl"),
+    "m.dae": (b"<xml>", "the suffix '.dae' is not a format of a mesh; use one of .glb .gltf .obj .off .ply .stl .vtk"),
     "empty.stl": (b"", "the file is empty; expected a mesh"),
 }  # fmt: skip
 

@@ -6,9 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pnu.io.e57 import read_e57
 from pnu.io.fields import arranged, as_colors
 from pnu.io.las import read_las
-from pnu.io.mesh import Geometry, read_gltf_mesh, read_obj, read_off, read_stl
+from pnu.io.mesh import Geometry, read_gltf_mesh, read_obj, read_off, read_stl, read_vtk_mesh
 from pnu.io.pcd import read_pcd
 from pnu.io.ply import element_sizes, read_ply
 from pnu.io.text import open_file, table, text_lines
@@ -212,6 +213,10 @@ def _read_las(path: Path) -> Cloud:
     return Cloud(*read_las(path))
 
 
+def _read_e57(path: Path) -> Cloud:
+    return _from_columns(path, read_e57(path))
+
+
 def _from_geometry(read: Callable[[Path], Geometry]) -> Callable[[Path], Cloud]:
     def cloud(path: Path) -> Cloud:
         vertices, faces, normals, colors = read(path)
@@ -230,6 +235,9 @@ READERS: dict[str, Callable[[Path], Cloud]] = {
     ".stl": _from_geometry(read_stl),
     ".glb": _from_geometry(read_gltf_mesh),
     ".gltf": _from_geometry(read_gltf_mesh),
+    ".vtk": _from_geometry(read_vtk_mesh),
+    ".vtp": _from_geometry(read_vtk_mesh),
+    ".e57": _read_e57,
     ".npy": _read_npy,
     ".las": _read_las,
     ".laz": _read_las,

@@ -13,17 +13,19 @@ from typing import Any
 import numpy as np
 
 from pnu.io import las_child
-from pnu.io.fields import XYZ, distinct
+from pnu.io.fields import GEOGRAPHIC, XYZ, distinct
 
 SLICE = 2**20  # points
 SLICE_BYTES = 2**28  # at most, whatever size of a point a header claims
 MOST = 100  # points that a byte of laz may hold: bounds what a damaged header makes us allocate
 NORMAL = ("nx", "ny", "nz")  # extra dimensions
 CARRIED = ("intensity", "classification", "gps_time")
+POINTWISE = b"\1\0"  # compressor of a laz without chunks
+MODEL_TYPE = 1024  # geo key: 1 projected, 2 geographic
 FOREIGN = "pnu "  # before the name of a scalar that las has, but not with such values
 COLORS = ("red", "green", "blue")
 LONGEST = 32 - len(FOREIGN)  # bytes of a name
-Content = tuple[np.ndarray, np.ndarray | None, dict[str, np.ndarray]]
+Content = tuple[np.ndarray, np.ndarray | None, dict[str, np.ndarray], tuple[str, ...]]
 
 
 def _laspy(path: Path) -> ModuleType:
@@ -35,15 +37,18 @@ def _laspy(path: Path) -> ModuleType:
 
 
 def read_las(path: Path) -> Content:
-    """Points (n, 3) float64, normals if there are, and colours, intensity, classification, time and extra scalars."""
+    """Points (n, 3) float64, normals if there are, colors, intensity, class, time and extra scalars, notes."""
     laspy = _laspy(path)
     try:
         _check_counts(path)
         with laspy.open(path) as file:
             if file.header.point_count > MOST * path.stat().st_size:
                 raise ValueError(f"its header promises {file.header.point_count} points, more than it has room for")
-            return _content(file.header, _slices(laspy, path, file))
+            notes = (GEOGRAPHIC,) if _geographic(file.header) else ()
+            return (*_content(file.header, _slices(laspy, path, file)), notes)
     except Exception as error:  # laspy and its decompressors know many kinds
+        if isinstance(error, ValueError) and str(error).startswith(f"{path}: is compressed"):
+            raise
         reason = (str(error).splitlines() or [""])[0][:80]
         raise ValueError(f"{path}: is no las file that can be read ({reason}); export it again") from None
 
@@ -70,6 +75,12 @@ def _slices(laspy: ModuleType, path: Path, file: Any) -> Iterator[Any]:
     if not header.are_points_compressed:
         yield from file.chunk_iterator(rows)
         return
+    for record in header.vlrs:
+        if type(record).__name__ == "LasZipVlr" and record.record_data_bytes()[:2] == POINTWISE:
+            raise ValueError(
+                f"{path}: is compressed in one piece, as by laszip 1, which lazrs cannot read; decompress it with "
+                f"laszip or las2las, or compress it anew: las2las -i {path.name} -o new.laz"
+            )
     command = [sys.executable, "-I", las_child.__file__, str(path), str(rows)]
     environment = os.environ | {"RUST_BACKTRACE": "0"}
     with (
@@ -87,7 +98,21 @@ def _slices(laspy: ModuleType, path: Path, file: Any) -> Iterator[Any]:
             )
 
 
-def _content(header: Any, slices: Iterator[Any]) -> Content:
+def _geographic(header: Any) -> bool:
+    """Whether its coordinate system has degrees for x and y: by its geo keys, or by its text (WKT)."""
+    for record in header.vlrs:
+        for key in getattr(record, "geo_keys", None) or []:
+            if key.id == MODEL_TYPE and key.tiff_tag_location == 0:
+                return key.value_offset == 2
+        text = str(getattr(record, "string", "") or "").lstrip("\0 \n").upper()
+        if text.startswith(("GEOGCS", "GEOGCRS", "GEODCRS", "GEOGRAPHICCRS")):
+            return True
+        if text.startswith("COMPD_CS") or text.startswith("COMPOUNDCRS"):
+            return "PROJCS" not in text and "PROJCRS" not in text
+    return False
+
+
+def _content(header: Any, slices: Iterator[Any]) -> tuple[np.ndarray, np.ndarray | None, dict[str, np.ndarray]]:
     n = header.point_count
     known = set(header.point_format.dimension_names)
     extra = [name for name in header.point_format.extra_dimension_names if name not in NORMAL]

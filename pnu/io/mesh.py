@@ -1,4 +1,4 @@
-"""Triangle meshes: ply, off, obj, stl; glb, gltf and vtk are read only."""
+"""Triangle meshes: ply, off, obj, stl; glb, gltf, vtk and vtp are read only."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +13,7 @@ from pnu.io.ply import Lists, read_ply, write_ply
 from pnu.io.polygons import triangulate
 from pnu.io.shift import read_shift, shifted, single_is_enough
 from pnu.io.text import indices, known_suffix, open_file, table, text_lines
+from pnu.io.vtk import read_vtk
 
 
 class Mesh(NamedTuple):
@@ -259,6 +260,15 @@ def read_gltf_mesh(path: Path) -> Geometry:
     return Geometry(vertices, faces, None, colors)
 
 
+def read_vtk_mesh(path: Path) -> Geometry:
+    vertices, counts, corners, columns = read_vtk(path)
+    colors = columns.get("colors", columns.get("RGB"))
+    good = colors is not None and colors.ndim == 2 and colors.shape[1] in (3, 4)
+    normals = next((v for name, v in columns.items() if name.lower() == "normals" and v.shape == vertices.shape), None)
+    faces = triangulate(vertices, counts, corners)
+    return Geometry(vertices, faces, normals, as_colors(colors)[:, :3] if colors is not None and good else None)
+
+
 def write_obj(path: Path, geometry: Geometry) -> None:
     vertices, faces, normals, colors = geometry
     rows = vertices if colors is None else np.hstack([vertices, np.asarray(colors) / 255])
@@ -304,6 +314,8 @@ READERS: dict[str, Callable[[Path], Geometry]] = {
     ".stl": read_stl,
     ".glb": read_gltf_mesh,
     ".gltf": read_gltf_mesh,
+    ".vtk": read_vtk_mesh,
+    ".vtp": read_vtk_mesh,
 }
 MESH_SUFFIXES = frozenset(READERS)
 MESH_OUTPUTS = frozenset({".ply", ".obj", ".off", ".stl"})

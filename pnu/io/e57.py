@@ -1,0 +1,34 @@
+"""Exchange format of laser scanners, all scans of a file in one place; needs pye57: pip install 'pnu[e57]'."""
+
+import importlib.util
+import io
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from pnu.io import e57_child
+
+SECONDS = 600
+NAMES = {
+    **{"cartesianX": "x", "cartesianY": "y", "cartesianZ": "z"},
+    **{"colorRed": "red", "colorGreen": "green", "colorBlue": "blue"},
+}
+
+
+def read_e57(path: Path) -> dict[str, np.ndarray]:
+    """Columns (n,): x y z float64 as the scans are placed, intensity, and red green blue, where all scans have them."""
+    if importlib.util.find_spec("pye57") is None:
+        raise ValueError(f"{path}: e57 needs pye57, which is not installed: pip install 'pnu[e57]'")
+    command = [sys.executable, "-I", e57_child.__file__, str(path)]
+    try:
+        done = subprocess.run(command, capture_output=True, check=False, timeout=SECONDS)
+        if done.returncode:
+            lines = done.stderr.decode(errors="replace").strip().splitlines()
+            raise ValueError(lines[-1][:80] if lines else f"its reader ended with {done.returncode}")
+        found: dict[str, np.ndarray] = dict(np.load(io.BytesIO(done.stdout)).items())
+    except (ValueError, OSError, subprocess.TimeoutExpired) as error:
+        reason = " ".join(str(error).split())[:80]
+        raise ValueError(f"{path}: is no e57 file that can be read ({reason}); export it again") from None
+    return {NAMES.get(name, name): values for name, values in found.items()}
