@@ -26,13 +26,19 @@ XYZ_PCD = b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\n"
 ROWS = "\n".join(f"{i} {i % 4} {i % 5}" for i in range(20))
 BAD_CLOUDS = {
     "empty.xyz": (b"", "the file is empty; expected a point cloud"),
-    "suffix.foo": (b"1", r"suffix '.foo' is not a format of a point cloud; use one of .e57 .glb"),
+    "suffix.foo": (b"1", r"suffix '.foo' is not a format of a point cloud; use one of .asc .csv .e57 .glb"),
     "plain": (b"1", "no suffix is not a format of a point cloud"),
     "words.xyz": (ROWS.replace("7 3 2", "seven 3 2").encode(), "line 8: expected numbers, found 'seven'"),
-    "header.txt": (f"x,y,z\n{ROWS}".encode(), "line 1: expected numbers, found 'x'; remove or comment"),
+    "names.txt": (f"a b c\n{ROWS}".encode(), r"expected points with x y z, found a b c; say .*columns=x,y,z"),
     "ragged.xyz": (f"{ROWS}\n1 2".encode(), "line 21 has 2 columns, those before have 3"),
-    "two.xyz": (b"1 2\n" * 20, r"has 2 columns; expected 3 \(x y z\) or 6"),
-    "five.xyz": (b"1 2 3 4 5\n" * 20, r"has 5 columns; expected 3 \(x y z\) or 6"),
+    "two.xyz": (b"1 2\n" * 20, "has 2 columns; expected x y z"),
+    "six.xyz": (b"1 2 3 4.5 500 6\n" * 20, r"neither unit normals nor colors.*say which they are: columns=x,y,z,nx,"),
+    "names.csv": (b"x,y,z,i\n" + b"1,2,3,4,5\n" * 20, "has 4 names of columns, line 2 has 5 columns; say them"),
+    "counted.pts": (f"30\n{ROWS}".encode(), "promises 30 points, holds 20; it is cut off"),
+    "commas.csv": (b"1,05,-2,50,3,75\n" * 20, "line 1: commas stand between numbers and within them; write decimal"),
+    "cut.ptx": (b"5\n4\n" + b"0 0 0\n" * 4 + b"1 0 0 0\n" * 4 + b"1 2 3 0.5\n" * 19, "promises 20 points, holds 19"),
+    "pts.ptx": (ROWS.encode(), "expected ptx: two counts"),
+    "text.npz": (b"PK\x03\x04" + bytes(99), "is no npz file of numbers"),
     "comments.xyz": (b"# nothing\n" * 20, "holds no numbers"),
     "binary.xyz": (bytes(range(256)), "holds binary data; expected text, as the suffix '.xyz' says"),
     "nan.xyz": (re.sub("(?m) .$", " nan", ROWS).encode(), "20 of 20 points left out: NaN, .* 16 others are needed"),
@@ -104,9 +110,9 @@ def test_no_file_and_folder(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("values", "found"),
     [
-        (np.zeros((20, 4)), "has 4 columns"),
+        (np.zeros((20, 2)), r"found float64 \(20, 2\)"),
         (np.zeros(20), r"found float64 \(20,\)"),
-        (np.array([["a"] * 3] * 20), r"expected an array \(n, 3\) or \(n, 6\) of numbers, found <U1"),
+        (np.array([["a"] * 3] * 20), r"expected an array \(n, 3\), .* of numbers, found <U1"),
         (np.zeros((20, 3), complex), "found complex128"),
     ],
 )

@@ -88,7 +88,7 @@ BAD = {
         "dense.e57: the suffix '.e57' is not a format of a point cloud",
     ),
     "folder": (("input=cloud.ply", "output=no/dense.ply"), "no/dense.ply: the folder no does not exist; create it"),
-    "columns": (("input=five.txt", "output=dense.ply"), "five.txt: has 5 columns; expected 3 (x y z) or 6"),
+    "columns": (("input=two.txt", "output=dense.ply"), "two.txt: has 2 columns; expected x y z"),
     "words": (("input=words.txt", "output=dense.ply"), "words.txt: line 1: expected numbers, found 'some'"),
     "same": (("input=cloud.ply", "output=./cloud.ply"), "output=./cloud.ply: is the input; give another name"),
     "ratio": ((*GOOD, "ratio=0.5"), "ratio=0.5: expected a number >= 1, the points out for each point in"),
@@ -110,7 +110,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     from pnu.upsample import main
 
     (place / "empty.ply").touch()
-    np.savetxt(place / "five.txt", np.ones((20, 5)))
+    np.savetxt(place / "two.txt", np.ones((20, 2)))
     (place / "words.txt").write_text("some words\n" * 20)
     before = {path: path.stat().st_mtime_ns for path in place.rglob("*") if path.is_file()}
     arguments, message = BAD[case]

@@ -1,19 +1,23 @@
-"""Point clouds read: ply, xyz, txt, pcd, obj, off, npy, las, laz."""
+"""Point clouds read, whatever the format, through one door."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from pnu.io.arrays import read_array
+from pnu.io.columns import SKIP, guessed, spelled
+from pnu.io.delimited import read_ptx, read_text
 from pnu.io.e57 import read_e57
-from pnu.io.fields import arranged, as_colors
+from pnu.io.fields import arranged
 from pnu.io.las import read_las
 from pnu.io.mesh import Geometry, read_gltf_mesh, read_obj, read_off, read_stl, read_vtk_mesh
 from pnu.io.pcd import read_pcd
 from pnu.io.ply import element_sizes, read_ply
-from pnu.io.text import open_file, table, text_lines
+from pnu.io.text import open_file
 
+TEXTS = (".xyz", ".txt", ".pts", ".asc", ".csv", ".tsv", ".pwn", ".xyzn", ".xyzrgb")
 LARGEST = 1e30  # beyond, squared distances leave the range of float64 or what float32 can hold after scaling
 LENGTH = 0.05  # by which that of a unit normal may differ from 1, as text rounds it
 
@@ -33,18 +37,26 @@ class Cloud(NamedTuple):
 
 
 @np.errstate(invalid="ignore", over="ignore")  # what is not finite is named by the checks
-def read_cloud(path: str | Path, *, minimum: int = 16, normals: bool = True) -> Cloud:
+def read_cloud(
+    path: str | Path, *, minimum: int = 16, normals: bool = True, columns: str | Sequence[str] | None = None
+) -> Cloud:
     """Read a point cloud, checked as by `check_cloud`; with `normals=False` without normals.
 
-    Text has three columns (x y z) or six (x y z and a normal, or a colour where the last three are no unit vectors);
-    of a mesh the vertices are taken. Coordinates stay float64.
+    columns: of text and of arrays without names, such as "x,y,z,_,r,g,b" (_ is left out); None: by the names in the
+    file, or by the usual order: x y z, then unit normals, colors and scalars where they stand.
+    Of a mesh the vertices are taken. Coordinates stay float64.
 
     Raises `ValueError` (one line: file, what was expected, what was found, what to do) for a missing, empty, damaged
     or unknown file, fewer than `minimum` points that can be used, and points that are all equal.
     """
     path = Path(path)
     suffix = open_file(path, "point cloud", CLOUD_SUFFIXES)
-    cloud = READERS[suffix](path)
+    if columns is None:
+        cloud = READERS[suffix](path)
+    elif suffix in TABLES:
+        cloud = READERS[suffix](path, spelled(columns))  # type: ignore[call-arg]
+    else:
+        raise ValueError(f"{path}: has names for what it holds; columns= is for text and arrays without")
     if not normals:
         cloud = cloud._replace(normals=None)
     return check_cloud(cloud, str(path), minimum=minimum)
@@ -132,49 +144,39 @@ def unit_normals(normals: np.ndarray | None) -> tuple[np.ndarray | None, list[st
     return scaled / size, notes
 
 
-def _read_text(path: Path) -> Cloud:
-    def lines() -> Iterator[str]:
-        return (line.replace(",", " ").replace(";", " ").replace("//", "#") for line in text_lines(path))
-
-    return _from_table(path, table(path, lines))
+def _read_text(path: Path, columns: Sequence[str] | None = None) -> Cloud:
+    return _from_table(path, *read_text(path, columns))
 
 
-def _read_npy(path: Path) -> Cloud:
-    try:
-        # Mapped first: a header that promises more than the file holds fails before anything is allocated.
-        values = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # numpy parses the header as Python and lets many kinds of error through
-        reason = (str(error).splitlines() or [""])[0][:80]
-        raise ValueError(f"{path}: is no npy file of numbers ({reason}); save it again") from None
-    if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu" or values.ndim != 2:
-        found = f"{values.dtype} {values.shape}" if isinstance(values, np.ndarray) else "an archive"
-        raise ValueError(f"{path}: expected an array (n, 3) or (n, 6) of numbers, found {found}")
-    return _from_table(path, np.array(values, np.float64))
+def _read_ptx(path: Path, columns: Sequence[str] | None = None) -> Cloud:
+    values, names, notes = read_ptx(path)
+    return _from_table(path, values, names if columns is None else list(columns), notes)
 
 
-def _from_table(path: Path, values: np.ndarray) -> Cloud:
-    """Three columns are points; three more are normals where they are unit vectors, or zero, and else colours."""
+def _read_array(path: Path, columns: Sequence[str] | None = None) -> Cloud:
+    values, notes = read_array(path)
+    if isinstance(values, np.ndarray):
+        return _from_table(path, values, None if columns is None else list(columns), notes)
+    if columns is not None:
+        raise ValueError(f"{path}: has names for what it holds; columns= is for text and arrays without")
+    return _from_columns(path, values, notes)
+
+
+def _from_table(path: Path, values: np.ndarray, names: list[str] | None, notes: tuple[str, ...]) -> Cloud:
+    """Columns by their names, or by the usual order."""
     if not values.size:
         raise ValueError(f"{path}: holds no numbers; expected x y z, or x y z and a normal, in each line")
-    points, more = values[:, :3], values[:, 3:]
-    if values.shape[1] == 3:
-        return Cloud(points, None, {})
-    if values.shape[1] == 9:  # as it is written, see `pnu.io.output`
-        return Cloud(points, values[:, 6:], {"colors": as_colors(values[:, 3:6])})
-    if values.shape[1] != 6:
-        raise ValueError(
-            f"{path}: has {values.shape[1]} columns; expected 3 (x y z) or 6 (x y z nx ny nz), remove the others"
-        )
-    lengths = np.linalg.norm(more, axis=1)
-    lengths = lengths[np.isfinite(lengths) & (lengths > 0)]
-    if not len(lengths) or np.mean(np.abs(lengths - 1) < 0.05) > 0.9:
-        return Cloud(points, more, {})
-    if more.min() >= 0 and (more.max() <= 1 or (more.max() <= 255 and np.array_equal(more, np.rint(more)))):
-        return Cloud(points, None, {"colors": as_colors(more)})
-    raise ValueError(
-        f"{path}: columns 4 to 6 are neither unit normals (median length {np.median(lengths):.3g}) nor colours "
-        "(0..1 or 0..255); scale the normals to length 1 or remove them"
-    )
+    if names is None:
+        if values.shape[1] < 3:
+            raise ValueError(
+                f"{path}: has {values.shape[1]} columns; expected x y z, and what else there is of a point"
+            )
+        names, more = guessed(str(path), values, path.suffix.lower())
+        notes = (*notes, *more)
+    if len(names) != values.shape[1]:
+        raise ValueError(f"{path}: columns={','.join(names)} are {len(names)} names, it has {values.shape[1]} columns")
+    columns = {name: column for name, column in zip(names, values.T, strict=True) if name != SKIP}
+    return _from_columns(path, columns, notes)
 
 
 def _read_ply(path: Path) -> Cloud:
@@ -201,12 +203,13 @@ def _read_pcd(path: Path) -> Cloud:
     return _from_columns(path, columns)
 
 
-def _from_columns(path: Path, columns: dict[str, np.ndarray]) -> Cloud:
+def _from_columns(path: Path, columns: dict[str, np.ndarray], notes: tuple[str, ...] = ()) -> Cloud:
     found = arranged(columns)
     if found.points is None:
-        raise ValueError(f"{path}: expected points with x y z, found {' '.join(columns) or 'none'}; save it again")
+        cure = "say which they are: columns=x,y,z,..." if path.suffix.lower() in TABLES else "save it again"
+        raise ValueError(f"{path}: expected points with x y z, found {' '.join(columns) or 'none'}; {cure}")
     attributes = found.others if found.colors is None else found.others | {"colors": found.colors}
-    return Cloud(found.points.astype(np.float64), found.normals, attributes, found.notes)
+    return Cloud(found.points.astype(np.float64), found.normals, attributes, (*notes, *found.notes))
 
 
 def _read_las(path: Path) -> Cloud:
@@ -225,10 +228,11 @@ def _from_geometry(read: Callable[[Path], Geometry]) -> Callable[[Path], Cloud]:
     return cloud
 
 
+TABLES = frozenset({*TEXTS, ".ptx", ".npy", ".npz"})  # whose columns may have no names
 READERS: dict[str, Callable[[Path], Cloud]] = {
     ".ply": _read_ply,
-    ".xyz": _read_text,
-    ".txt": _read_text,
+    **dict.fromkeys(TEXTS, _read_text),
+    ".ptx": _read_ptx,
     ".pcd": _read_pcd,
     ".obj": _from_geometry(read_obj),
     ".off": _from_geometry(read_off),
@@ -238,7 +242,8 @@ READERS: dict[str, Callable[[Path], Cloud]] = {
     ".vtk": _from_geometry(read_vtk_mesh),
     ".vtp": _from_geometry(read_vtk_mesh),
     ".e57": _read_e57,
-    ".npy": _read_npy,
+    ".npy": _read_array,
+    ".npz": _read_array,
     ".las": _read_las,
     ".laz": _read_las,
 }

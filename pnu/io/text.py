@@ -29,12 +29,25 @@ def known_suffix(path: Path, content: str, suffixes: Iterable[str]) -> str:
 
 
 def text_lines(path: Path) -> Iterator[str]:
-    """Lines of a text file."""
+    """Lines of a text file, in UTF-8 or UTF-16, with or without a byte order mark."""
     with path.open("rb") as handle:
-        if b"\0" in handle.read(4096):
-            raise ValueError(f"{path}: holds binary data; expected text, as the suffix '{path.suffix}' says")
-    with path.open(encoding="utf-8", errors="replace") as handle:
+        encoding = _encoding(handle.read(4096))
+    if encoding is None:
+        raise ValueError(f"{path}: holds binary data; expected text, as the suffix '{path.suffix}' says")
+    with path.open(encoding=encoding, errors="replace") as handle:
         yield from handle
+
+
+def _encoding(head: bytes) -> str | None:
+    """Of a text that begins so; None for binary data."""
+    if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return "utf-16"
+    if b"\0" not in head:
+        return "utf-8-sig"
+    first, second = head[0:-1:2], head[1::2]
+    if not any(second) and all(first):
+        return "utf-16-le"
+    return "utf-16-be" if not any(first) and all(second) else None
 
 
 def table(path: Path, lines: Callable[[], Iterable[str]], *, first_line: int = 1) -> np.ndarray:
