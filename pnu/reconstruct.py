@@ -15,7 +15,7 @@ from pnu.run.progress import busy
 class Reconstruct:
     """Make a triangle mesh from a point cloud file, and measure it against the true surface where there is one."""
 
-    input: str = doc("cloud to read: ply, xyz, txt, pcd, obj, off, npy, las or laz")
+    input: str = doc("cloud to read: ply, xyz, txt, pcd, obj, off, npy, las, laz, stl, glb, gltf, vtk, vtp or e57")
     output: str = doc("mesh to write: ply (keeps colours and errors), obj, off or stl")
     normals: str = doc("auto: the file's, estimated where it has none; estimate: always estimated")
     depth: int | None = doc("of the octree, 8 is usual, one more is twice as fine; null: from the points' spacing")

@@ -78,6 +78,9 @@ BAD_CLOUDS = {
     "none.obj": (b"# nothing\n", "holds 0 points; at least 16 are needed"),
     "none.off": (b"COFFEE\n", "expected the numbers of vertices and faces, found 'EE'"),
     "other.off": (b"solid x\n", "expected 'OFF' in the first line, found 'solid x'"),
+    "long.off": (b"OFF\n16 0 0\n" + b"1 2 3\n" * 20, "goes on after the last face, with 4 lines more"),
+    "long.pcd": (XYZ_PCD + b"POINTS 16\nDATA ascii\n" + ROWS.encode(), "after the last point, with 4 lines more"),
+    "long_binary.pcd": (XYZ_PCD + b"POINTS 16\nDATA binary\n" + b"abc4" * 60, " the last point, with 48 bytes more"),
     "short.off": (b"OFF\n100 0 0\n1 2 3\n", "promises 100 vertices and 0 faces, the file holds 1 lines more"),
 }  # fmt: skip
 

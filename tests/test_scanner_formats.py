@@ -198,6 +198,7 @@ def test_vtp(tmp_path: Path, form: str, packed: bool) -> None:
         ("m.vtk", legacy(False, 5).replace(b"POLYGONS 13", b"POLYGONS 12")),
         ("m.vtk", b"# vtk DataFile Version 3.0\nx\nASCII\nDATASET STRUCTURED_POINTS\n"),
         ("m.vtk", legacy(True, 3)[:200]),
+        ("m.vtk", b"# vtk DataFile Version 3.0\nx\nASCII\nDATASET POLYDATA\nNORMALS a float\nSCALARS b float\n1"),
         ("m.vtp", b"<!DOCTYPE a [<!ENTITY b 'c'>]><VTKFile type='PolyData'/>"),
         ("m.vtp", b"<VTKFile type='UnstructuredGrid'/>"),
         ("m.vtp", xml("appended raw", True).replace(b"offset='0'", b"offset='9'")),

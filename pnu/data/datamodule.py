@@ -203,7 +203,7 @@ class SyntheticDataModule(GeneratedDataModule):
 
 
 class MeshDataModule(GeneratedDataModule):
-    """Patches of a folder of meshes (ply, off, obj, stl): python -m pnu.train data=meshes data.root=FOLDER.
+    """Patches of a folder of meshes (ply, off, obj, stl, glb, gltf, vtk, vtp): data=meshes data.root=FOLDER.
 
     Args:
         root: the folder; its subfolders count too.
@@ -217,7 +217,9 @@ class MeshDataModule(GeneratedDataModule):
     @functools.cached_property
     def files(self) -> dict[str, Path]:
         if self.root is None:
-            raise ValueError("data.root=FOLDER is required: a folder of meshes (ply, off, obj, stl)")
+            raise ValueError(
+                "data.root=FOLDER is required: a folder of meshes (ply, off, obj, stl, glb, gltf, vtk, vtp)"
+            )
         return meshes_of(self.root)
 
     def makers(self) -> dict[str, Callable[[], Mesh]]:

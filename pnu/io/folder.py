@@ -5,6 +5,8 @@ from pathlib import Path
 
 from pnu.io.mesh import MESH_SUFFIXES
 
+KINDS = ", ".join(suffix[1:] for suffix in sorted(MESH_SUFFIXES))
+
 
 def files_of(folder: str | Path, suffixes: Collection[str], *, below: bool = False) -> list[Path]:
     """Files of these suffixes in a folder, in `below` or in its subfolders too, sorted; hidden ones are left out, among
@@ -21,7 +23,7 @@ def meshes_of(root: str | Path) -> dict[str, Path]:
     """
     root = Path(root)
     if not root.is_dir():
-        raise ValueError(f"data.root={root}: no such folder; expected one with meshes (ply, off, obj, stl)")
+        raise ValueError(f"data.root={root}: no such folder; expected one with meshes ({KINDS})")
     found: dict[str, Path] = {}
     for path in files_of(root, MESH_SUFFIXES, below=True):
         name = path.relative_to(root).with_suffix("").as_posix().replace("/", "_")
@@ -29,5 +31,5 @@ def meshes_of(root: str | Path) -> dict[str, Path]:
             raise ValueError(f"data.root={root}: {found[name]} and {path} are both named {name}; rename or move one")
         found[name] = path
     if not found:
-        raise ValueError(f"data.root={root}: expected meshes (ply, off, obj, stl), found none")
+        raise ValueError(f"data.root={root}: expected meshes ({KINDS}), found none")
     return found

@@ -204,6 +204,11 @@ def read_off(path: Path) -> Geometry:
     if len(sizes) < 2 or not all(size.isdecimal() and len(size) < 16 for size in sizes[:2]):
         raise ValueError(f"{path}: expected the numbers of vertices and faces, found '{' '.join(sizes)[:30]}'")
     vertex_count, face_count = int(sizes[0]), int(sizes[1])
+    if (more := len(lines) - body - vertex_count - face_count) > 0:
+        raise ValueError(
+            f"{path}: goes on after the last face, with {more} lines more than the header promises; correct its counts "
+            f"({vertex_count} vertices, {face_count} faces), or save it again"
+        )
     if len(lines) - body < vertex_count + face_count:
         raise ValueError(
             f"{path}: the header promises {vertex_count} vertices and {face_count} faces, the file holds "

@@ -39,6 +39,8 @@ def read_pcd(path: Path) -> dict[str, np.ndarray]:
     elif mode == "binary":
         if points * dtype.itemsize > len(data) - start:
             raise _short(path, points * dtype.itemsize, len(data) - start)
+        if data[start + points * dtype.itemsize :].strip(b"\0\r\n\t "):
+            raise _long(path, points, f"{len(data) - start - points * dtype.itemsize} bytes")
         rows = np.frombuffer(data, dtype, points, start) if points else np.empty(0, dtype)
         columns = [rows[name] for name in dtype.names or ()]
     elif mode == "binary_compressed":
@@ -78,13 +80,22 @@ def _short(path: Path, promised: int, found: int) -> ValueError:
     )
 
 
+def _long(path: Path, points: int, more: str) -> ValueError:
+    return ValueError(
+        f"{path}: goes on after the last point, with {more} more than the {points} points that the header promises; "
+        "correct POINTS, WIDTH and HEIGHT there, or save it again"
+    )
+
+
 def _text(path: Path, body: bytes, points: int, dtype: np.dtype) -> list[np.ndarray]:
     lines = [line for line in body.decode("ascii", "replace").splitlines() if line.strip()]
     if len(lines) < points:
         raise ValueError(
             f"{path}: the header promises {points} points, the file holds {len(lines)}; it is cut off, copy it again"
         )
-    values = table(path, lambda: lines[:points])
+    if len(lines) > points:
+        raise _long(path, points, f"{len(lines) - points} lines")
+    values = table(path, lambda: lines)
     widths = [dtype[i].shape[0] for i in range(len(dtype.names or ()))]
     if not points:
         values = np.empty((0, sum(widths)))

@@ -100,7 +100,7 @@ def _legacy(path: Path) -> Content:
     body = _Body(data, sum(len(line) + 1 for line in head[:3]), head[2].strip() == b"BINARY")
     vertices, counts, corners = np.empty((0, 3)), np.empty(0, np.int64), np.empty(0, np.int64)
     columns: dict[str, np.ndarray] = {}
-    of_points = False
+    of_points, count = False, 0
     while words := body.line():
         key, rest = words[0].upper(), words[1:]
         if key == "DATASET" and rest[0].upper() not in ("POLYDATA", "UNSTRUCTURED_GRID"):

@@ -26,7 +26,7 @@ class Data:
 
     _target_: str = doc("class of pnu.data")
     path: str | None = doc("HDF5 file of patches (data=patches)")
-    root: str | None = doc("folder of meshes: ply, off, obj, stl (data=meshes)")
+    root: str | None = doc("folder of meshes: ply, off, obj, stl, glb, gltf, vtk, vtp (data=meshes)")
     kinds: list[str] = doc("of procedural shapes: organic, cad (data=synthetic)")
     patches: int = doc("cut from all shapes together")
     cache: str = doc("folder of the files of patches that are cut")
