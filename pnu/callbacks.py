@@ -49,7 +49,7 @@ class Checkpoints(pl.Callback):
         self.run, self.monitor = run, monitor
         self.every_n_steps, self.every_s = every_n_steps, 60 * every_minutes
         self.best = math.inf
-        self.saved_step, self.saved_at, self.due = 0, time.monotonic(), False
+        self.saved_step, self.saved_at, self.due = 0, 0.0, False
 
     def state_dict(self) -> dict[str, Any]:
         return {"best": self.best}
@@ -57,14 +57,14 @@ class Checkpoints(pl.Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.best = float(state_dict["best"])
 
-    def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
+    def on_train_batch_end(self, trainer: pl.Trainer, module: Any, *_: Any) -> None:
         step = trainer.global_step
         if step == self.saved_step:  # gradients are still being accumulated
             return
         by_steps = self.every_n_steps and step % self.every_n_steps == 0
-        by_time = self.every_s and time.monotonic() - self.saved_at >= self.every_s
-        # all processes must save together, and their clocks differ
-        self.due = trainer.strategy.broadcast(bool(by_steps or by_time))
+        # all processes must save together, and the module's clock is theirs in common
+        by_time = self.every_s and module.elapsed_s - self.saved_at >= self.every_s
+        self.due = bool(by_steps or by_time or ends(trainer))
         # Lightning takes a validation for done when it goes on from a checkpoint between the step and the validation
         if self.due and not validation_follows(trainer):
             self.save_last(trainer)
@@ -80,17 +80,28 @@ class Checkpoints(pl.Callback):
             self.best = found[self.monitor]
             trainer.save_checkpoint(self.run.best, weights_only=True)
             self.run.add_metrics("validation", [found, {"step": trainer.global_step}])
-        if self.due:
+        if self.due or trainer.should_stop:
             self.save_last(trainer)
 
     def on_train_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
-        self.save_last(trainer)
+        if trainer.global_step != self.saved_step or not self.run.last.exists():
+            self.save_last(trainer)
 
     def save_last(self, trainer: pl.Trainer) -> None:
         for logger in trainer.loggers:
             logger.save()  # what is logged reaches the disk no later than the checkpoint
         trainer.save_checkpoint(self.run.last)
-        self.saved_step, self.saved_at, self.due = trainer.global_step, time.monotonic(), False
+        module: Any = trainer.lightning_module
+        self.saved_step, self.saved_at, self.due = trainer.global_step, module.elapsed_s, False
+
+
+def ends(trainer: pl.Trainer) -> bool:
+    """Whether the step that just ended is the last. It is saved here and not at the end of the training, where
+    Lightning counts the epoch as done: a run that is made longer then would not go on within it."""
+    epoch_ends = trainer.fit_loop.epoch_loop.batch_progress.is_last_batch
+    last_epoch = trainer.max_epochs is not None and 0 < trainer.max_epochs <= trainer.current_epoch + 1
+    last_step = 0 < trainer.max_steps <= trainer.global_step
+    return trainer.should_stop or last_step or (epoch_ends and last_epoch)
 
 
 def validation_follows(trainer: pl.Trainer) -> bool:

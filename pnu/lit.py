@@ -4,8 +4,9 @@ import inspect
 import logging
 import math
 import os
+import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -77,11 +78,26 @@ class NonFinite(ValueError):
     """NaN or infinity in the loss or its gradient; the message names the step and the term."""
 
 
+def joined(batches: Sequence[Batch]) -> dict[str, Any]:
+    """Several batches as one: tensors and lists; what else a batch has is left out."""
+    return {
+        name: torch.cat([batch[name] for batch in batches])
+        if isinstance(value, Tensor)
+        else [item for batch in batches for item in batch[name]]
+        for name, value in batches[0].items()
+        if isinstance(value, Tensor | list)
+    }
+
+
+def _finite(value: Tensor) -> bool:
+    return math.isfinite(float(value))
+
+
 class UpsamplingModule(pl.LightningModule):
     """A network and its loss.
 
     A batch has "input" (B, n, 6), "target" (B, m, 6) and whatever else the loss reads. Logged are every loss term at
-    every step (train/cd ... train/loss), the norm of the gradient, the learning rate, and the metrics of
+    every step (train/cd ... train/loss; means over the micro-batches of a step and over processes), the norm of the gradient, the learning rate, and the metrics of
     `CloudMetrics` over validation (val/...) and test (test/...) clouds, each in the frame of its patch.
 
     Args:
@@ -107,6 +123,8 @@ class UpsamplingModule(pl.LightningModule):
         self.optimizer, self.scheduler = optimizer, scheduler
         normals = bool(getattr(model, "predicts_normals", True))
         self.val_metrics, self.test_metrics = CloudMetrics(normals), CloudMetrics(normals)
+        self.micro_batches: list[tuple[dict[str, Tensor], Batch]] = []  # of this step: values and batch
+        self.started_at, self.elapsed_s = time.monotonic(), 0.0  # elapsed_s is the same in all processes
 
     def forward(self, patch: Tensor) -> Tensor:
         return self.model(patch)
@@ -114,31 +132,47 @@ class UpsamplingModule(pl.LightningModule):
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         assert self.loss is not None
         outputs = {name: value.float() for name, value in self.model.outputs(batch["input"]).items()}
-        self.check_finite({"prediction": outputs["prediction"].detach().abs().amax()}, batch)
-        # searches and small differences of coordinates want float32, whatever the network computed in
-        with torch.autocast(self.device.type, enabled=False):
-            terms = self.loss(outputs["prediction"], batch["target"], {**batch, **outputs})
-        self.terms = {name: value.detach() for name, value in terms.items()}
-        self.check_finite(self.terms, batch)
-        self.batch = batch
+        found = {"prediction": outputs["prediction"].detach().abs().amax()}
+        try:
+            # searches and small differences of coordinates want float32, whatever the network computed in
+            with torch.autocast(self.device.type, enabled=False):
+                terms = self.loss(outputs["prediction"], batch["target"], {**batch, **outputs})
+        except Exception:  # a loss may break at NaN, with words about something else
+            self.micro_batches.append((found, batch))
+            self.check_finite(found)
+            raise
+        self.micro_batches.append((found | {name: value.detach() for name, value in terms.items()}, batch))
         return terms["loss"]
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """Checks and logs the step: means over its micro-batches and over processes, in one transfer from the device."""
         gradients = [p.grad for p in self.parameters() if p.grad is not None]
-        norm = torch.nn.utils.get_total_norm(gradients) if gradients else torch.zeros(())
-        if self.trainer.precision != "16-mixed":  # whose scaler expects infinite gradients and skips their step
-            self.check_finite({"gradient": norm}, self.batch)
-        self.batch = {}
-        means = self.trainer.strategy.reduce(torch.stack(list(self.terms.values())), reduce_op="mean")  # over processes
-        values = {f"train/{name}": value for name, value in zip(self.terms, means.tolist(), strict=True)}
-        values |= {"train/gradient_norm": float(norm), "train/lr": float(optimizer.param_groups[0]["lr"])}
-        self.log_dict(values, logger=False)
+        norm = torch.nn.utils.get_total_norm(gradients) if gradients else torch.zeros((), device=self.device)
+        names = list(self.micro_batches[0][0])
+        found = torch.stack(
+            [torch.stack([values[name].to(norm) for name in names]) for values, _ in self.micro_batches]
+        )
+        clock = norm.new_tensor(time.monotonic() - self.started_at)
+        means = self.trainer.strategy.reduce(torch.cat([found.mean(0), norm[None], clock[None]]), reduce_op="mean")
+        *numbers, gradient_norm, self.elapsed_s = means.tolist()
+        values = dict(zip(names, numbers, strict=True))
+        # in mixed precision the scaler expects infinite gradients and skips their step
+        self.check_finite(values if self.trainer.precision == "16-mixed" else values | {"gradient": gradient_norm})
+        self.micro_batches = []
+        del values["prediction"]
+        logged = {f"train/{name}": value for name, value in values.items()}
+        logged |= {"train/gradient_norm": gradient_norm, "train/lr": float(optimizer.param_groups[0]["lr"])}
+        # as tensors of the CPU: a number would be sent to the device, and back where it is shown
+        self.log_dict({name: torch.tensor(value) for name, value in logged.items()}, logger=False)
         # written at once, before the checkpoint of this step: a training that is killed after it loses no step's values
         for logger in self.loggers:
-            logger.log_metrics(values, self.global_step)
+            logger.log_metrics(logged, self.global_step)
 
-    def check_finite(self, values: Mapping[str, Tensor], batch: Batch) -> None:
-        """Stop the training at NaN or infinity and keep the batch for inspection.
+    def check_finite(self, values: Mapping[str, float | Tensor]) -> None:
+        """Stop the training at NaN or infinity and keep the micro-batches that it comes from for inspection.
+
+        Args:
+            values: of a step, means over micro-batches and processes.
 
         Raises:
             NonFinite: names the step, the terms and the file with the batch.
@@ -146,9 +180,11 @@ class UpsamplingModule(pl.LightningModule):
         broken = [name for name, value in values.items() if not math.isfinite(float(value))]
         if not broken:
             return
+        here = [(terms, batch) for terms, batch in self.micro_batches if not all(map(_finite, terms.values()))]
+        kept = here or self.micro_batches  # of a gradient alone any of them may be the cause
         path = Path(self.trainer.default_root_dir) / f"nonfinite_step{self.global_step}_rank{self.global_rank}.pt"
-        content = {"step": self.global_step, "terms": {k: float(v) for k, v in values.items()}, "batch": dict(batch)}
-        write(path, content)
+        terms = {name: float(value) for name, value in (kept[0][0] if here else values).items()}
+        write(path, {"step": self.global_step, "terms": terms, "batch": joined([batch for _, batch in kept])})
         first = next((name for name in broken if name != "loss"), broken[0])
         raise NonFinite(
             f"step {self.global_step}: {first} is {float(values[first])}; the batch is in {path};"

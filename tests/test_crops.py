@@ -1,16 +1,21 @@
 """Training data of the surface model: crops, true surfaces, order, and one training step."""
 
 import pickle
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import lightning.pytorch as pl
 import numpy as np
 import pytest
 import torch
 
 from pnu.data import shapes
 from pnu.data.crops import Crops, WholeClouds, flattened
-from pnu.data.projection import Order, ProjectionDataModule
+from pnu.data.projection import ProjectionDataModule
 from pnu.data.truth import Truth
 from pnu.io import Mesh, write_mesh
+from pnu.lit import TRAINER_OPTIONS, quieten
 from pnu.losses.surface import SurfaceLoss
 from pnu.models.surface import Surface
 from pnu.ops.surface import closest_points, face_normals, sample_area
@@ -87,15 +92,6 @@ def test_validation_clouds_do_not_change(meshes: dict[str, Mesh]) -> None:
     assert torch.equal(first[1]["input"], second[1]["input"])
 
 
-def test_order_goes_on_where_it_stopped() -> None:
-    whole = list(Order(6, 2, 0, 2))
-    assert whole == [(2, i) for i in range(6)]
-    resumed = Order(6, 2, 1, 2)
-    assert list(resumed) == whole[2:]
-    resumed.set_epoch(3)
-    assert list(resumed) == [(3, i) for i in range(6)]
-
-
 def test_loss_is_zero_on_the_surface_and_grows_off_it(meshes: dict[str, Mesh]) -> None:
     truth = Truth(list(meshes.values()))
     batch = flattened([Crops(meshes, 4, size=80, views=2)[0, i] for i in range(4)])
@@ -116,6 +112,131 @@ def test_loss_is_zero_on_the_surface_and_grows_off_it(meshes: dict[str, Mesh]) -
     assert loss(flipped[-1], batch["target"], {**extra, "projected": flipped})["normal"] > 1.9
 
 
+@pytest.fixture(scope="module")
+def folder(meshes: dict[str, Mesh], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("meshes")
+    for name, mesh in meshes.items():
+        write_mesh(path / f"{name}.ply", mesh)
+    return path
+
+
+def data_module(folder: Path, **options: Any) -> ProjectionDataModule:
+    small = {"clouds": 16, "size": 64, "views": 1, "batch_size": 2, "points": 64, "workers": 0, "seed": 0}
+    return ProjectionDataModule(
+        **({"root": str(folder), "procedural": False, "validation": NAMES[:2], "normals": "given"} | small | options)
+    )
+
+
+def inputs(data: ProjectionDataModule) -> list[torch.Tensor]:
+    return [batch["input"] for batch in data.train_dataloader()]
+
+
+def test_processes_draw_different_clouds(folder: Path) -> None:
+    """Together those of one process with the whole batch; of the validation clouds each process gets its own."""
+    parts, shapes_of = [], []
+    for rank in (0, 1):
+        data = data_module(folder)
+        data.trainer = SimpleNamespace(global_rank=rank, world_size=2)  # type: ignore[assignment]
+        data.setup()
+        parts.append(inputs(data))
+        shapes_of.append([name for batch in data.val_dataloader() for name in batch["shape"]])
+    alone = data_module(folder, batch_size=4)
+    alone.setup()
+    whole = inputs(alone)
+    assert len(parts[0]) == len(parts[1]) == len(whole) == 4
+    for ours, theirs, both in zip(*parts, whole, strict=True):
+        assert torch.equal(torch.stack([ours, theirs], 1).flatten(0, 1), both)
+    assert not any(torch.equal(a, b) for a in torch.cat(parts[0]) for b in torch.cat(parts[1]))
+    assert sorted(shapes_of) == sorted([[name] for name in NAMES[:2]])
+
+
+def test_a_process_without_validation_clouds_takes_them_all(folder: Path) -> None:
+    data = data_module(folder, validation=NAMES[:1])
+    data.trainer = SimpleNamespace(global_rank=1, world_size=2)  # type: ignore[assignment]
+    data.setup()
+    assert len(data.val_dataloader()) == 1
+
+
+class Recorder(pl.LightningModule):
+    """Keeps what it is given."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+        self.seen: list[torch.Tensor] = []
+
+    def training_step(self, batch: dict[str, Any], batch_idx: int) -> torch.Tensor:
+        self.seen.append(batch["input"])
+        return self.weight * 0
+
+    def validation_step(self, *_: Any) -> None:
+        pass
+
+    def configure_optimizers(self) -> Any:
+        optimizer = torch.optim.SGD(self.parameters(), lr=0.1)
+        # knows the number of steps: Lightning asks for the data before it has restored its own position
+        steps = int(self.trainer.estimated_stepping_batches)
+        return [optimizer], [torch.optim.lr_scheduler.LinearLR(optimizer, total_iters=steps)]
+
+
+class Stop(pl.Callback):
+    """Keeps a checkpoint after a step."""
+
+    def __init__(self, path: Path, step: int) -> None:
+        self.path, self.step = path, step
+
+    def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
+        if trainer.global_step == self.step and not self.path.exists():
+            trainer.save_checkpoint(self.path)
+
+
+@pytest.mark.parametrize("stop", [1, 4, 5])
+def test_a_training_with_accumulated_gradients_goes_on_with_the_rest(stop: int, folder: Path, tmp_path: Path) -> None:
+    """Eight batches an epoch, two to a step: after `stop` steps come the batches from 2 stop on."""
+    quieten()
+
+    def seen(start: Path | None = None) -> list[torch.Tensor]:
+        module = Recorder()
+        trainer = pl.Trainer(
+            max_steps=6, max_epochs=2, accumulate_grad_batches=2, logger=False, accelerator="cpu",
+            callbacks=[Stop(tmp_path / "stop.ckpt", stop)], limit_val_batches=0, default_root_dir=tmp_path, **TRAINER_OPTIONS,
+        )  # fmt: skip
+        trainer.fit(module, data_module(folder), ckpt_path=start, weights_only=True)
+        return module.seen
+
+    whole = seen()
+    assert len(whole) == 12
+    assert not torch.equal(whole[0], whole[8])
+    rest = seen(tmp_path / "stop.ckpt")
+    assert len(rest) == 12 - 2 * stop
+    assert all(map(torch.equal, rest, whole[2 * stop :]))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"size": 1000}, r"data\.size=1000: expected 16 to 600, the points of the smallest clouds that are drawn"),
+        ({"size": 1}, r"data\.size=1: expected 16 to 600"),
+        ({"views": 0}, "expected clouds >= 1 and views >= 1, found 16 and 0"),
+        ({"clouds": 0}, r"data\.batch_size=2: expected at most the 0 training clouds of data\.clouds=0"),
+        ({"batch_size": 17}, r"data\.batch_size=17: expected at most the 16 training clouds of data\.clouds=16"),
+        ({"batch_size": 0}, "expected batch_size >= 1 and workers >= 0, found 0 and 0"),
+        ({"workers": -1}, "expected batch_size >= 1 and workers >= 0, found 2 and -1"),
+        ({"points": 15}, r"data\.points=15: expected at least 16"),
+        ({"normals": "guessed"}, r"data\.normals=guessed"),
+    ],
+)
+def test_bad_options_are_refused_before_the_training(options: dict[str, Any], message: str, folder: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        data_module(folder, **options).setup()
+
+
+@pytest.mark.parametrize(("size", "normals"), [(600, "given"), (600, "estimated"), (16, "estimated")])
+def test_crops_of_the_greatest_and_the_least_size_stack(meshes: dict[str, Mesh], size: int, normals: str) -> None:
+    crops = Crops(meshes, 4, size=size, views=1, normals=normals)
+    assert flattened([crops[0, i] for i in range(4)])["input"].shape == (4, size, 6)
+
+
 def test_data_module_and_a_few_steps(tmp_path, meshes: dict[str, Mesh]) -> None:
     for name, mesh in meshes.items():
         write_mesh(tmp_path / f"{name}.ply", mesh)
@@ -124,7 +245,7 @@ def test_data_module_and_a_few_steps(tmp_path, meshes: dict[str, Mesh]) -> None:
         workers=0, seed=0,
     )  # fmt: skip
     data.setup()
-    assert data.train_set.names == NAMES[1:] or set(data.train_set.names) == set(NAMES[1:])
+    assert set(data.datasets["train"].names) == set(NAMES[1:])
     torch.manual_seed(0)
     model, loss = Surface(queries=32), SurfaceLoss()
     optimizer = torch.optim.Adam(model.parameters(), 3e-3)

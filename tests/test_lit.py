@@ -9,7 +9,7 @@ import lightning.pytorch as pl
 import pytest
 import torch
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, Subset
 
 from pnu.lit import TRAINER_OPTIONS, NonFinite, UpsamplingModule, quieten
 from pnu.losses import CompoundLoss
@@ -197,11 +197,157 @@ def test_schedule_of_an_endless_training_is_refused(tmp_path: Path) -> None:
         trainer(tmp_path, max_steps=-1, max_epochs=-1).fit(lit, loader(), loader(2))
 
 
+class Shares(pl.LightningDataModule):
+    """Clouds of which each process sees its own: with two of them, three quarters and one."""
+
+    def __init__(self, length: int) -> None:
+        super().__init__()
+        self.length = length
+
+    def share(self, batch_size: int) -> DataLoader:
+        assert self.trainer is not None
+        most = 3 * self.length // 4
+        parts = [range(self.length)] if self.trainer.world_size == 1 else [range(most), range(most, self.length)]
+        return DataLoader(Subset(Spheres(self.length), parts[self.trainer.global_rank]), batch_size=batch_size)
+
+    def train_dataloader(self) -> DataLoader:
+        return self.share(self.length)
+
+    def val_dataloader(self) -> DataLoader:
+        return self.share(1)
+
+
 def test_two_processes_validate_like_one(tmp_path: Path) -> None:
-    """Metrics are sums over processes: two processes that see all clouds find the mean of one."""
-    (alone,) = trainer(tmp_path).validate(module(), loader(4), verbose=False)
-    (both,) = trainer(tmp_path, devices=2, strategy="ddp_fork").validate(module(), loader(4), verbose=False)
+    """Metrics are sums over processes, each with clouds of its own and not as many."""
+    (alone,) = trainer(tmp_path).validate(module(), Shares(4), verbose=False)
+    (both,) = trainer(tmp_path, devices=2, strategy="ddp_fork").validate(module(), Shares(4), verbose=False)
     assert both == pytest.approx(alone, rel=1e-5)
+
+
+class OneOfEach(Shares):
+    def share(self, batch_size: int) -> DataLoader:
+        assert self.trainer is not None
+        return DataLoader(Subset(Spheres(2), [self.trainer.global_rank] if self.trainer.world_size == 2 else [0, 1]), 2)
+
+
+class Table(pl.Callback):
+    """Writes the logged values of the first process to a file: it may be another process than the test's."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def on_train_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if trainer.is_global_zero:
+            values = {name: float(value) for name, value in trainer.callback_metrics.items()}
+            torch.save({**values, "elapsed": module.elapsed_s}, self.path)
+
+
+def test_logged_terms_are_means_over_processes(tmp_path: Path) -> None:
+    found = []
+    for name, more in (("one", {}), ("two", {"devices": 2, "strategy": "ddp_fork"})):
+        path = tmp_path / f"{name}.pt"
+        options = {"max_steps": 1, "limit_val_batches": 0, "callbacks": [Table(path)], **more}
+        trainer(tmp_path, **options).fit(module(), OneOfEach(2))
+        found.append(torch.load(path))
+        assert found[-1].pop("elapsed") > 0
+    assert found[1] == pytest.approx(found[0], rel=1e-5)
+    values = [terms_of(i) for i in (0, 1)]
+    assert found[1]["train/cd"] == pytest.approx((values[0]["cd"] + values[1]["cd"]) / 2, rel=1e-5)
+    assert values[0]["cd"] != pytest.approx(values[1]["cd"], rel=1e-3)
+
+
+def terms_of(index: int) -> dict[str, float]:
+    """Terms of the untrained module on one cloud."""
+    lit, sample = module(), Spheres(9)[index]
+    assert lit.loss is not None
+    with torch.no_grad():
+        terms = lit.loss(lit(sample["input"][None]), sample["target"][None])
+    return {name: float(value) for name, value in terms.items()}
+
+
+@pytest.mark.parametrize(("batches", "micro"), [(6, [3, 3]), (5, [3, 2])])
+def test_logged_terms_are_means_over_the_micro_batches_of_a_step(
+    batches: int, micro: list[int], tmp_path: Path
+) -> None:
+    """Also where the last step of an epoch has fewer of them. The optimizer stands still: values are of one state."""
+    record = Record()
+    still = functools.partial(torch.optim.SGD, lr=0.0)
+    data = DataLoader(Spheres(batches), batch_size=1)
+    options = {"accumulate_grad_batches": 3, "max_steps": -1, "max_epochs": 1}
+    trainer(tmp_path, record, **options).fit(module(optimizer=still), data, loader(2))
+    each = [terms_of(i) for i in range(batches)]
+    assert each[0]["cd"] != pytest.approx(each[2]["cd"], rel=1e-3)
+    for name in ("cd", "point_knn", "normal", "normal_orth", "normal_knn", "loss"):
+        values = [terms[name] for terms in each]
+        expected = [sum(values[:3]) / 3, sum(values[3:]) / micro[1]]
+        assert record.values(f"train/{name}") == pytest.approx(expected, rel=1e-5), name
+
+
+@pytest.mark.parametrize("broken", [0, 1, 2])
+def test_nan_in_any_micro_batch_stops_and_keeps_that_one(broken: int, tmp_path: Path) -> None:
+    data = DataLoader(Spheres(3, broken=broken), batch_size=1)
+    with pytest.raises(NonFinite, match=r"step 0: prediction is nan"):
+        trainer(tmp_path, accumulate_grad_batches=3, max_steps=1).fit(module(), data, loader(2))
+    saved = torch.load(next(tmp_path.glob("nonfinite*.pt")), weights_only=True)
+    assert saved["batch"]["index"].tolist() == [broken]
+    assert math.isnan(saved["terms"]["prediction"])
+
+
+def test_what_a_batch_has_beside_tensors_does_not_spoil_the_file(tmp_path: Path) -> None:
+    """A batch of the surface model holds the true surfaces, an object."""
+
+    class Data(pl.LightningDataModule):
+        def train_dataloader(self) -> DataLoader:
+            return DataLoader(Spheres(2, broken=0), batch_size=2)
+
+        val_dataloader = train_dataloader
+
+        def on_after_batch_transfer(self, batch: dict[str, Any], dataloader_idx: int) -> dict[str, Any]:
+            return {**batch, "surface": object()}
+
+    with pytest.raises(NonFinite, match="prediction is nan"):
+        trainer(tmp_path, limit_val_batches=0).fit(module(), Data())
+    saved = torch.load(next(tmp_path.glob("nonfinite*.pt")), weights_only=True)
+    assert set(saved["batch"]) == {"input", "target", "index", "shape"}
+
+
+class Nearness(nn.Module):
+    """A loss that asks for no value itself."""
+
+    def forward(self, prediction: Tensor, target: Tensor, extra: Any) -> dict[str, Tensor]:
+        terms = {name: (prediction.mean() - target.mean()).square() * i for i, name in enumerate("abcd")}
+        return {**terms, "loss": torch.stack(list(terms.values())).sum()}
+
+
+def test_one_transfer_a_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each float(tensor), item or tolist of a value waits for the device."""
+    asked: list[str] = []
+    lit = module()
+    lit.loss = Nearness()
+    monkeypatch.setattr(lit, "log_dict", lambda *_, **__: None)  # of the CPU
+    for name in ("item", "tolist", "__float__", "__bool__", "__int__"):
+        plain = getattr(Tensor, name)
+
+        def call(self: Tensor, *arguments: Any, name: str = name, plain: Any = plain) -> Any:
+            if inside:
+                asked.append(name)
+            return plain(self, *arguments)
+
+        monkeypatch.setattr(Tensor, name, call)
+    inside: list[str] = []
+    for name in ("training_step", "on_before_optimizer_step"):
+        wrapped = getattr(lit, name)
+
+        @functools.wraps(wrapped)
+        def watched(*arguments: Any, name: str = name, wrapped: Any = wrapped) -> Any:
+            inside.append(name)
+            result = wrapped(*arguments)
+            inside.pop()
+            return result
+
+        monkeypatch.setattr(lit, name, watched)
+    trainer(tmp_path, accumulate_grad_batches=2, max_steps=3, max_epochs=-1).fit(lit, loader(8), loader(2))
+    assert asked == ["tolist"] * 3
 
 
 def test_mixed_precision_trains(tmp_path: Path) -> None:

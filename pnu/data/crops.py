@@ -15,6 +15,7 @@ from pnu.ops.surface import sample_area, sample_poisson_disk
 
 SIZES = (600, 8000)  # points of a cloud, evenly spread in the logarithm, for half of the clouds
 USUAL = (1500, 6500)  # and for the other half
+SMALLEST = 16  # points of a crop, or of a cloud for validation, from which surfaces can be told
 MARGIN = 32  # points beyond a crop that its estimated normals need
 
 
@@ -37,6 +38,12 @@ class Crops(Dataset[dict[str, Any]]):
     ) -> None:  # fmt: skip
         if normals not in ("given", "estimated"):
             raise ValueError(f"data.normals={normals}: expected given or estimated")
+        if not SMALLEST <= size <= SIZES[0]:
+            raise ValueError(
+                f"data.size={size}: expected {SMALLEST} to {SIZES[0]}, the points of the smallest clouds that are drawn"
+            )
+        if length < 1 or views < 1:
+            raise ValueError(f"data: expected clouds >= 1 and views >= 1, found {length} and {views}")
         self.names, self.meshes = list(meshes), list(meshes.values())
         self.length, self.size, self.views = length, size, views
         self.estimated, self.seed = normals == "estimated", seed

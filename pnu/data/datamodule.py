@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Dataset, Subset
 
 from pnu.data import shapes
 from pnu.data.augment import from_options
@@ -18,7 +18,85 @@ from pnu.data.patchset import build, check
 from pnu.io import Mesh, meshes_of, read_mesh
 
 
-class PatchDataModule(pl.LightningDataModule):
+class EpochDataModule(pl.LightningDataModule):
+    """What all data modules share: the order of samples, each process's share of them, and where a training goes on.
+
+    `setup` makes `datasets`, by the names "train" (whose items are asked for by (epoch, index)), "val" and "test".
+
+    Args:
+        batch_size: samples of a training step, in each process.
+        workers: processes that load; 0 loads in the training's own.
+        seed: of the order.
+    """
+
+    kind = "samples"  # what a sample is called in messages
+    collate: Callable[[Any], Any] | None = None
+    collate_evaluation: Callable[[Any], Any] | None = None
+
+    def __init__(self, batch_size: int, workers: int, seed: int) -> None:
+        super().__init__()
+        if batch_size < 1 or workers < 0:
+            raise ValueError(f"data: expected batch_size >= 1 and workers >= 0, found {batch_size} and {workers}")
+        self.batch_size, self.workers, self.seed = batch_size, workers, seed
+        self.evaluation_batch_size = batch_size
+        self.resumed = 0, 1  # batches done, batches of an epoch
+        self.datasets: dict[str, Dataset[Any]] = {}
+
+    @property
+    def process(self) -> tuple[int, int]:
+        """Number of this process and how many there are."""
+        return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+
+    def check_batch_size(self, samples: int, source: str) -> None:
+        """ValueError where the training samples do not fill one batch of every process."""
+        _, world = self.process
+        if samples < self.batch_size * world:
+            raise ValueError(
+                f"data.batch_size={self.batch_size}: expected at most the {samples} training {self.kind} of {source}"
+                + (f" divided by {world} processes" if world > 1 else "")
+            )
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        rank, world = self.process
+        data = self.datasets["train"]
+        sampler = EpochSampler(len(data), self.batch_size, seed=self.seed, rank=rank, world=world)  # type: ignore[arg-type]
+        done, per_epoch = self.resumed
+        sampler.start_at(done // per_epoch, done % per_epoch)
+        return self.loader(data, self.batch_size, sampler=sampler, collate_fn=self.collate)
+
+    def val_dataloader(self) -> DataLoader[Any]:
+        return self.evaluation_loader("val")
+
+    def test_dataloader(self) -> DataLoader[Any]:
+        return self.evaluation_loader("test")
+
+    def evaluation_loader(self, part: str) -> DataLoader[Any]:
+        rank, world = self.process
+        data = self.datasets[part]
+        number: int = len(data)  # type: ignore[arg-type]
+        if number >= world:  # of fewer every process takes all: the mean over all of them is the same
+            data = Subset(data, range(rank, number, world))
+        return self.loader(data, self.evaluation_batch_size, collate_fn=self.collate_evaluation)
+
+    def loader(self, data: Dataset[Any], batch_size: int, **options: Any) -> DataLoader[Any]:
+        # spawned workers: a fork of a process with threads may hang
+        context = "spawn" if self.workers else None
+        return DataLoader(
+            data, batch_size, num_workers=self.workers, multiprocessing_context=context,
+            persistent_workers=self.workers > 0, **options,
+        )  # fmt: skip
+
+    def state_dict(self) -> dict[str, Any]:
+        """Batches, not steps: several may make one step."""
+        assert self.trainer is not None
+        progress: Any = self.trainer.fit_loop.epoch_loop.batch_progress.total
+        return {"batches": progress.processed, "per_epoch": int(self.trainer.num_training_batches)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.resumed = int(state_dict["batches"]), max(1, int(state_dict["per_epoch"]))
+
+
+class PatchDataModule(EpochDataModule):
     """Patches of a file: python -m pnu.train data=patches data.path=FILE.
 
     A batch holds "input" (B, input_points, 6) and "target" (B, target_points, 6), float32, in the unit sphere of each
@@ -27,14 +105,14 @@ class PatchDataModule(pl.LightningDataModule):
 
     Args:
         path: HDF5 file, see data/README.md.
-        batch_size: patches of a training step, in each process.
-        workers: processes that load; 0 loads in the training's own.
-        seed: of order, downsampling and augmentation.
+        batch_size, workers, seed: see `EpochDataModule`; the seed is of downsampling and augmentation too.
         input_points, target_points, downsampling, strength, centers: see `pnu.data.dataset.Options`.
         evaluation: downsampling of validation and test; None: the training's.
         augmentation: arguments of `pnu.data.augment.Augmentation`; None: none.
         val_share, test_share: of the shapes, kept for validation and test.
     """
+
+    kind = "patches"
 
     def __init__(
         self,
@@ -53,15 +131,12 @@ class PatchDataModule(pl.LightningDataModule):
         val_share: float = 0.1,
         test_share: float = 0.1,
     ) -> None:
-        super().__init__()
-        if batch_size < 1 or workers < 0:
-            raise ValueError(f"data: expected batch_size >= 1 and workers >= 0, found {batch_size} and {workers}")
-        self.path, self.batch_size, self.workers, self.seed = path, batch_size, workers, seed
+        super().__init__(batch_size, workers, seed)
+        self.path = path
         self.options = Options(input_points, target_points, downsampling, strength, centers)
         self.evaluation = self.options._replace(downsampling=evaluation or downsampling)
         self.augmentation = from_options(augmentation)
         self.shares = {"val": val_share, "test": test_share}
-        self.resumed = 0, 1  # batches done, batches of an epoch
         self.rows: dict[str, list[int]] | None = None
 
     def patch_file(self) -> Path:
@@ -84,12 +159,8 @@ class PatchDataModule(pl.LightningDataModule):
             print(f"{self.file} has no shape names: validation and test are its last blocks of consecutive patches")
         self.names = contents.names
         self.rows = split(contents.names, contents.patches, **self.shares, seed=0)
-        world = self.trainer.world_size if self.trainer else 1
-        if len(self.rows["train"]) < self.batch_size * world:
-            raise ValueError(
-                f"data.batch_size={self.batch_size}: expected at most the {len(self.rows['train'])} training patches"
-                f" of {self.file}" + (f" divided by {world} processes" if world > 1 else "")
-            )
+        self.check_batch_size(len(self.rows["train"]), str(self.file))
+        self.datasets = {part: self.dataset(part) for part in self.rows}
 
     def dataset(self, part: str) -> PatchDataset:
         """The samples of "train", "val" or "test"."""
@@ -100,42 +171,6 @@ class PatchDataModule(pl.LightningDataModule):
             self.file, self.rows[part], options, seed=self.seed if part == "train" else 0,
             augmentation=augmentation, names=self.names,
         )  # fmt: skip
-
-    def train_dataloader(self) -> DataLoader[Any]:
-        rank, world = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
-        data = self.dataset("train")
-        sampler = EpochSampler(len(data), self.batch_size, seed=self.seed, rank=rank, world=world)
-        done, per_epoch = self.resumed
-        sampler.start_at(done // per_epoch, done % per_epoch)
-        return self.loader(data, sampler=sampler)
-
-    def val_dataloader(self) -> DataLoader[Any]:
-        return self.evaluation_loader("val")
-
-    def test_dataloader(self) -> DataLoader[Any]:
-        return self.evaluation_loader("test")
-
-    def evaluation_loader(self, part: str) -> DataLoader[Any]:
-        data = self.dataset(part)
-        if self.trainer and self.trainer.world_size > 1:
-            data.rows = data.rows[self.trainer.global_rank :: self.trainer.world_size]
-        return self.loader(data)
-
-    def loader(self, data: PatchDataset, **options: Any) -> DataLoader[Any]:
-        # spawned workers: a fork of a process with threads may hang
-        context = "spawn" if self.workers else None
-        return DataLoader(
-            data, self.batch_size, num_workers=self.workers, multiprocessing_context=context,
-            persistent_workers=self.workers > 0, **options,
-        )  # fmt: skip
-
-    def state_dict(self) -> dict[str, Any]:
-        assert self.trainer is not None
-        progress: Any = self.trainer.fit_loop.epoch_loop.batch_progress.total
-        return {"batches": progress.processed, "per_epoch": int(self.trainer.num_training_batches)}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.resumed = int(state_dict["batches"]), max(1, int(state_dict["per_epoch"]))
 
 
 class GeneratedDataModule(PatchDataModule):
