@@ -97,8 +97,9 @@ class UpsamplingModule(pl.LightningModule):
     """A network and its loss.
 
     A batch has "input" (B, n, 6), "target" (B, m, 6) and whatever else the loss reads. Logged are every loss term at
-    every step (train/cd ... train/loss; means over the micro-batches of a step and over processes), the norm of the gradient, the learning rate, and the metrics of
-    `CloudMetrics` over validation (val/...) and test (test/...) clouds, each in the frame of its patch.
+    every step (train/cd ... train/loss; means over the micro-batches of the step and over processes), the norm of the
+    gradient, the learning rate, and the metrics of `CloudMetrics` over validation (val/...) and test (test/...) clouds,
+    each in the frame of its patch.
 
     Args:
         model: maps patches (B, n, 6) to (B, ratio n, 6 or 3).
@@ -145,15 +146,14 @@ class UpsamplingModule(pl.LightningModule):
         return terms["loss"]
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Checks and logs the step: means over its micro-batches and over processes, in one transfer from the device."""
+        """Checks and logs the step: means over micro-batches and processes, in one transfer from the device."""
         gradients = [p.grad for p in self.parameters() if p.grad is not None]
         norm = torch.nn.utils.get_total_norm(gradients) if gradients else torch.zeros((), device=self.device)
         names = list(self.micro_batches[0][0])
-        found = torch.stack(
-            [torch.stack([values[name].to(norm) for name in names]) for values, _ in self.micro_batches]
-        )
+        found = torch.stack([values[name].to(norm) for values, _ in self.micro_batches for name in names])
         clock = norm.new_tensor(time.monotonic() - self.started_at)
-        means = self.trainer.strategy.reduce(torch.cat([found.mean(0), norm[None], clock[None]]), reduce_op="mean")
+        means = torch.cat([found.view(-1, len(names)).mean(0), norm[None], clock[None]])
+        means = self.trainer.strategy.reduce(means, reduce_op="mean")
         *numbers, gradient_norm, self.elapsed_s = means.tolist()
         values = dict(zip(names, numbers, strict=True))
         # in mixed precision the scaler expects infinite gradients and skips their step

@@ -199,7 +199,8 @@ def test_a_training_with_accumulated_gradients_goes_on_with_the_rest(stop: int, 
         module = Recorder()
         trainer = pl.Trainer(
             max_steps=6, max_epochs=2, accumulate_grad_batches=2, logger=False, accelerator="cpu",
-            callbacks=[Stop(tmp_path / "stop.ckpt", stop)], limit_val_batches=0, default_root_dir=tmp_path, **TRAINER_OPTIONS,
+            callbacks=[Stop(tmp_path / "stop.ckpt", stop)], limit_val_batches=0, default_root_dir=tmp_path,
+            **TRAINER_OPTIONS,
         )  # fmt: skip
         trainer.fit(module, data_module(folder), ckpt_path=start, weights_only=True)
         return module.seen
