@@ -153,6 +153,44 @@ def test_gradient_in_eval_mode_reaches_the_input() -> None:
     assert torch.autograd.gradcheck(network, x)
 
 
+@pytest.mark.parametrize("widths", [(3, 5), (3, 5, 4)])
+@pytest.mark.parametrize("way", ["chunks", "layers", "projected", "synchronized"])
+def test_one_row_is_refused_and_leaves_the_statistics_alone(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, way: str, widths: tuple[int, ...]
+) -> None:
+    network = mlp(*widths)
+    before = copy.deepcopy(network.state_dict())
+    x = torch.randn(1, widths[1] if way == "projected" else 3, dtype=torch.float64)
+    if way == "layers":
+        monkeypatch.setattr(layers, "streamed", lambda *_: False)
+    if way == "synchronized":
+        store = torch.distributed.FileStore(str(tmp_path / "store"), 1)
+        torch.distributed.init_process_group("gloo", store=store, rank=0, world_size=1)
+        synchronize(network)
+    try:
+        with pytest.raises(ValueError, match=r"batch norm: expected 2 rows or more in a training step, found 1; raise"):
+            network(x, projected=way == "projected")
+        with pytest.raises(ValueError, match="found 1"):
+            network.layers[0].norm(torch.randn(1, widths[1], dtype=torch.float64))
+    finally:
+        if way == "synchronized":
+            torch.distributed.destroy_process_group()
+    for name, value in network.state_dict().items():
+        assert torch.equal(value, before[name]), name
+
+
+def test_a_row_that_counts_several_times_has_no_variance_but_statistics() -> None:
+    """A ball with one point is filled up with copies of it."""
+    network = mlp(3, 5)
+    groups = distinct(torch.zeros(1, 1, 8, dtype=torch.long), 1)
+    network(torch.randn(1, 3, dtype=torch.float64), groups=groups)
+    assert all(value.isfinite().all() for value in network.buffers())
+
+
+def test_eval_mode_takes_one_row() -> None:
+    assert mlp(3, 5, 4).eval()(torch.randn(1, 3, dtype=torch.float64)).isfinite().all()
+
+
 def test_distinct_neighbours() -> None:
     idx = torch.tensor([[[3, 3, 3], [0, 2, 0], [1, 2, 3]]])
     groups = distinct(idx, 4)

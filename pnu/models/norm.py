@@ -8,12 +8,18 @@ from torch.distributed.nn.functional import all_reduce
 
 class BatchNorm(nn.BatchNorm1d):
     """`nn.BatchNorm1d` of rows (R, C). With `synchronized`, its moments are those of the rows of all processes, as
-    `nn.SyncBatchNorm` has them, which knows GPUs only."""
+    `nn.SyncBatchNorm` has them, which knows GPUs only.
+
+    ValueError for a single row in training mode: it has no variance.
+    """
 
     synchronized = False
 
     def forward(self, rows: Tensor) -> Tensor:
-        if not (self.training and self.synchronized and torch.distributed.is_initialized()):
+        together = self.training and self.synchronized and torch.distributed.is_initialized()
+        if self.training:
+            check_rows(len(rows) * (torch.distributed.get_world_size() if together else 1))
+        if not together:
             return super().forward(rows)
         count = everywhere(rows.new_full((1,), len(rows)))
         mean = everywhere(rows.sum(0)) / count
@@ -30,6 +36,15 @@ class BatchNorm(nn.BatchNorm1d):
         momentum = 1 / self.num_batches_tracked.item() if self.momentum is None else self.momentum
         self.running_mean.lerp_(mean.to(self.running_mean.dtype), momentum)
         self.running_var.lerp_(variance.to(self.running_var.dtype), momentum)
+
+
+def check_rows(count: float) -> None:
+    """ValueError where a step's rows, in all processes, have no variance that statistics could be made of."""
+    if count < 2:
+        raise ValueError(
+            f"batch norm: expected 2 rows or more in a training step, found {count:g}; raise data.batch_size or"
+            " data.input_points"
+        )
 
 
 def everywhere(sums: Tensor) -> Tensor:

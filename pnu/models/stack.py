@@ -29,7 +29,7 @@ from torch.autograd.function import once_differentiable
 from pnu.models.chunks import Chunk, Scratch, group_chunks, row_chunks, spread
 from pnu.models.layer import Layer
 from pnu.models.neighborhoods import Groups, ungroup
-from pnu.models.norm import BatchNorm, everywhere
+from pnu.models.norm import BatchNorm, check_rows, everywhere
 from pnu.ops.combine import scatter
 
 FAR = 8  # deviations between threshold and mean, beyond which their difference costs too many digits
@@ -281,6 +281,7 @@ def _statistics(layer: Layer, weight: Tensor | None, below: Norm | None, moments
         count, total, square = _everywhere(norm, count.expand_as(mean), count * mean, square + count * mean.square())
         mean = total / count
         square = square - count * mean.square()
+    check_rows(float(count.max()))
     inverse = (square / count + norm.eps).rsqrt()
     plain = mean + moments.constant if moments.taken_off else mean
     if weight is not None and below is not None:
