@@ -17,7 +17,7 @@ import torch
 from torch import nn
 
 from pnu import checkpoint, classical, metrics, surfaces
-from pnu.evaluation import METRICS, Case, Row, source, summarize
+from pnu.evaluation import Case, Row, columns, source, summarize
 from pnu.evaluation.cases import generator
 from pnu.evaluation.report import cell
 from pnu.inference import upsample
@@ -127,10 +127,11 @@ def poisson(cases: list[Case], setting: Setting, methods: list[str], seed: int, 
 
 
 def cloud_lines(rows: list[Row]) -> list[str]:
-    heads = [f"{METRICS[name].head}" for name in COLUMNS]
-    lines = [f"| input | method | {' | '.join(heads)} |", "|---|---|" + "---|" * len(COLUMNS)]
+    shown = [one for one in columns(rows) if one.name in COLUMNS]
+    heads = [one.head for one in shown]
+    lines = [f"| input | method | {' | '.join(heads)} |", "|---|---|" + "---|" * len(shown)]
     for summary in summarize(rows):
-        cells = (cell(summary, name) for name in COLUMNS)
+        cells = (cell(summary, one) for one in shown)
         lines.append(f"| {summary['kind']} | {summary['method']} | {' | '.join(cells)} |")
     return lines
 

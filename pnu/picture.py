@@ -10,7 +10,7 @@ from pnu.run import command, doc
 
 @dataclass
 class Picture:
-    """Draw clouds and meshes side by side, all with one camera, as PNG; no display or graphics card is needed."""
+    """Draw clouds and meshes side by side, seen from the same side, as PNG; no display or graphics card is needed."""
 
     inputs: list[str] = doc("files to draw, a panel each: [a.ply,b.obj,...]; with faces as meshes, others as clouds")
     output: str = doc("png to write")
@@ -20,7 +20,9 @@ class Picture:
     colormap: str = doc("of quality. error: red = zero to blue = high; perceptual: dark to light")
     limit: float | None = doc("quality at the end of the colours; null: what 98 % of the points stay below")
     label: str = doc("of the colour bar")
-    fit: int = doc("panel that fills the picture, counted from 1: 0 for all of them together")
+    fit: int | None = doc(
+        "panel whose camera shows all, counted from 1; 0: all of them together; null: 1, each its own if elsewhere"
+    )
     azimuth: float = doc("degrees that the shape is turned about the axis up=")
     elevation: float = doc("degrees that the camera looks from above")
     up: str = doc("axis that points up: x, y or z")
@@ -42,7 +44,7 @@ def picture(cfg: Any) -> None:
         raise ValueError("inputs=[]: expected one file or more, such as inputs=[dense.ply,mesh.ply]")
     if captions is not None and len(captions) != len(inputs):
         raise ValueError(f"captions: found {len(captions)} for {len(inputs)} inputs; give one for each")
-    if not 0 <= cfg.fit <= len(inputs):
+    if cfg.fit is not None and not 0 <= cfg.fit <= len(inputs):
         raise ValueError(f"fit={cfg.fit}: expected a panel, 1 to {len(inputs)}, or 0 for all")
     for name, value, choices in (("color", cfg.color, COLORS), ("colormap", cfg.colormap, tuple(COLORMAPS))):
         if value not in choices:
@@ -57,11 +59,14 @@ def picture(cfg: Any) -> None:
     check_writable(cfg.output)
     shapes = [read_shape(path) for path in inputs]
     bar = quality_bar(shapes, cfg.color, cfg.limit, cfg.colormap, cfg.label)
-    fitted = shapes if cfg.fit == 0 else [shapes[cfg.fit - 1]]
-    points = [shape.points for shape in fitted]
-    camera = pictures.look_at(*points, azimuth=cfg.azimuth, elevation=cfg.elevation, up=cfg.up)
+    points = [shape.points for shape in shapes]
+    apart = cfg.fit is None and not pictures.in_one_place(*points)
+    side = {"azimuth": cfg.azimuth, "elevation": cfg.elevation, "up": cfg.up}
+    one = pictures.look_at(*(points if cfg.fit == 0 else [points[(cfg.fit or 1) - 1]]), **side)
+    cameras = [pictures.look_at(own, **side) if apart else one for own in points]
     panels = [
-        shape.draw(camera, cfg.color, bar, size=cfg.size, radius=cfg.radius, smooth=cfg.smooth) for shape in shapes
+        shape.draw(camera, cfg.color, bar, size=cfg.size, radius=cfg.radius, smooth=cfg.smooth)
+        for shape, camera in zip(shapes, cameras, strict=True)
     ]
     names = [Path(path).stem for path in inputs] if captions is None else list(captions)
     image = pictures.figure(panels, names, columns=cfg.columns, colorbar=bar)
@@ -69,6 +74,8 @@ def picture(cfg: Any) -> None:
     if not cfg.quiet:
         kinds = (f"{'mesh' if s.mesh is not None else 'cloud'}, color={s.source(cfg.color)}" for s in shapes)
         print(f"panels: {', '.join(f'{path} ({kind})' for path, kind in zip(inputs, kinds, strict=True))}")
+        if apart:
+            print("scale:  each panel its own, since the shapes differ in size or place; fit=1 shows all as the first")
         for shape in shapes:
             for note in shape.notes:
                 print(f"        {shape.path}: {note}")

@@ -6,6 +6,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import re
 import subprocess
 import sys
 import time
@@ -20,7 +21,7 @@ from pnu.run.quoting import shell_line, typed_line
 INTERRUPTED = 130  # exit code of a program that Ctrl-C ends
 PACKAGES = ("pnu", "torch", "lightning", "numpy", "scipy", "hydra-core")
 # keys that change where or how a run is told about, not what it computes
-UNHASHED = ("run", "resume", "name", "quiet", "logger", "sweep", "objective")
+UNHASHED = ("run", "resume", "name", "quiet", "logger", "sweep", "objective", "metrics", "allow")
 UNHASHED_DATA = ("quiet", "workers", "cache")
 
 
@@ -157,6 +158,12 @@ def new_path(name: str) -> Path:
         except FileExistsError:
             continue
     raise ValueError(f"{parent}: holds 1000 runs of this second; give run=FOLDER")
+
+
+def run_name(folder: str | Path) -> str:
+    """What a run is called where it stands beside others: the name of its folder without the time before it."""
+    name = Path(folder).resolve().name
+    return re.sub(r"^\d\d-\d\d-\d\d_(?=.)", "", name)
 
 
 def config_hash(config: Mapping[str, Any]) -> str:
