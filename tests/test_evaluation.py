@@ -383,13 +383,13 @@ SMALL = ["points=256", "truth_points=500", "shapes=[heat_sink,cup]", "part=all",
 
 
 def test_command_with_a_run(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    main([*SMALL, "ratio=2", "save=true", "normals=estimate"])
+    main([*SMALL, "run=newest", "ratio=2", "save=true", "normals=estimate"])
     out = capsys.readouterr().out
     folder = place / "outputs" / "small" / "evaluation" / "synthetic"
     assert "random: 256 -> 512 points" in out
     assert "normals of the input estimated. CD: mean squared distances" in out
     assert "output: outputs/small/evaluation/synthetic/metrics.json" in out
-    assert out.endswith("next:   python -m pnu.compare methods=[outputs/small,apss]\n")
+    assert out.endswith("next:   python -m pnu.compare 'methods=[outputs/small,apss]'\n")
     found = read_json(folder / "metrics.json")
     assert (found["subject"], found["ratio"], found["normals"], found["points"]) == (
         "outputs/small",
