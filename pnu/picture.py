@@ -3,7 +3,7 @@
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from pnu.run import command, doc
 
@@ -12,10 +12,11 @@ from pnu.run import command, doc
 class Picture:
     """Draw clouds and meshes side by side, seen from the same side, as PNG; no display or graphics card is needed."""
 
+    commas: ClassVar = ("columns",)
     inputs: list[str] = doc("files to draw, a panel each: [a.ply,b.obj,...]; with faces as meshes, others as clouds")
     output: str = doc("png to write")
     captions: list[str] | None = doc("a caption for each panel; null: the names of the files")
-    columns: int | None = doc("panels in a row; null: all, up to six")
+    columns: str | None = doc("panels in a row, null: all, up to six; or, as x,y,z,_,r,g,b, those of text files")
     color: str = doc("auto: the first that a file has; quality: scalar of that name; stored; normal; plain")
     colormap: str = doc("of quality. error: red = zero to blue = high; perceptual: dark to light")
     limit: float | None = doc("quality at the end of the colours; null: what 98 % of the points stay below")
@@ -35,6 +36,7 @@ class Picture:
 def picture(cfg: Any) -> None:
     from pnu import pictures
     from pnu.io import check_writable
+    from pnu.io.cloud import TABLES
     from pnu.ops.colors import COLORMAPS
     from pnu.pictures.files import COLORS, quality_bar, read_shape
 
@@ -49,15 +51,19 @@ def picture(cfg: Any) -> None:
     for name, value, choices in (("color", cfg.color, COLORS), ("colormap", cfg.colormap, tuple(COLORMAPS))):
         if value not in choices:
             raise ValueError(f"{name}={value}: expected one of {', '.join(choices)}")
-    for name, value in (("limit", cfg.limit), ("radius", cfg.radius), ("columns", cfg.columns)):
+    for name, value in (("limit", cfg.limit), ("radius", cfg.radius)):
         if value is not None and not value > 0:
             raise ValueError(f"{name}={value:g}: expected a number above 0")
+    number = cfg.columns is not None and cfg.columns.lstrip("-").isdecimal()
+    if number and int(cfg.columns) < 1:
+        raise ValueError(f"columns={cfg.columns}: expected a number above 0, or names such as x,y,z,_,r,g,b")
+    across, columns = (int(cfg.columns), None) if number else (None, cfg.columns)
     if not 16 <= cfg.size <= 4096:
         raise ValueError(f"size={cfg.size}: expected 16 to 4096 pixels")
     if Path(cfg.output).suffix.lower() != ".png":
         raise ValueError(f"output={cfg.output}: expected a name that ends in .png")
     check_writable(cfg.output)
-    shapes = [read_shape(path) for path in inputs]
+    shapes = [read_shape(path, columns if Path(path).suffix.lower() in TABLES else None) for path in inputs]
     bar = quality_bar(shapes, cfg.color, cfg.limit, cfg.colormap, cfg.label)
     points = [shape.points for shape in shapes]
     apart = cfg.fit is None and not pictures.in_one_place(*points)
@@ -69,7 +75,7 @@ def picture(cfg: Any) -> None:
         for shape, camera in zip(shapes, cameras, strict=True)
     ]
     names = [Path(path).stem for path in inputs] if captions is None else list(captions)
-    image = pictures.figure(panels, names, columns=cfg.columns, colorbar=bar)
+    image = pictures.figure(panels, names, columns=across, colorbar=bar)
     pictures.save_png(cfg.output, image)
     if not cfg.quiet:
         kinds = (f"{'mesh' if s.mesh is not None else 'cloud'}, color={s.source(cfg.color)}" for s in shapes)

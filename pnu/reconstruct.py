@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from pnu.run import command, doc, shell_line
 from pnu.run.progress import busy
@@ -15,9 +15,13 @@ from pnu.run.progress import busy
 class Reconstruct:
     """Make a triangle mesh from a point cloud file, and measure it against the true surface where there is one."""
 
+    commas: ClassVar = ("columns",)
     input: str = doc("cloud to read: ply, xyz, txt, pcd, obj, off, npy, las, laz, stl, glb, gltf, vtk, vtp or e57")
     output: str = doc("mesh to write: ply (keeps colours and errors), obj, off or stl")
     normals: str = doc("auto: the file's, estimated where it has none; estimate: always estimated")
+    columns: str | None = doc(
+        "of text, or an array without names: x,y,z,_,r,g,b (_ is left out); null: by its names or the usual order"
+    )
     depth: int | None = doc("of the octree, 8 is usual, one more is twice as fine; null: from the points' spacing")
     trim: float = doc("share of the least supported vertices to cut off, for open surfaces, such as 0.05")
     truth: str | None = doc("mesh of the true surface: the error of each vertex is measured, stored and coloured")
@@ -40,7 +44,7 @@ def reconstruct(cfg: Any) -> None:
     started = time.perf_counter()
     say: Callable[[str], None] = (lambda text: None) if cfg.quiet else print
     check(cfg)
-    points, normals, attributes, notes = io.read_cloud(cfg.input, normals=cfg.normals == "auto")
+    points, normals, attributes, notes = io.read_cloud(cfg.input, normals=cfg.normals == "auto", columns=cfg.columns)
     origin = "with normals" if normals is not None else "normals estimated and oriented"
     say(f"input:  {cfg.input}, {len(points)} points, {origin}")
     for note in notes:
