@@ -40,6 +40,7 @@ def reconstruct(cfg: Any) -> None:
 
     from pnu import io, surfaces
     from pnu.ops.mesh import open_edges, vertex_normals
+    from pnu.ops.survey import survey
 
     started = time.perf_counter()
     say: Callable[[str], None] = (lambda text: None) if cfg.quiet else print
@@ -49,6 +50,8 @@ def reconstruct(cfg: Any) -> None:
     say(f"input:  {cfg.input}, {len(points)} points, {origin}")
     for note in notes:
         say(f"        {note}")
+    for text in survey(points, normals).warnings():
+        warn(text)
     truth = None
     if cfg.truth:
         truth = io.read_mesh(cfg.truth)
@@ -85,6 +88,8 @@ def reconstruct(cfg: Any) -> None:
     say(f"output: {cfg.output}, {counts}, {time.perf_counter() - started:.1f} s")
     for note in notes:
         say(f"        {note}")
+    for text in survey(points, normals).warnings():
+        warn(text)
     say(f"next:   {shell_line('picture', inputs=[cfg.input, cfg.output], output='picture.png')}")
 
 

@@ -69,7 +69,10 @@ def upsample(cfg: Any) -> None:
     from pnu.checkpoint import NEWEST
     from pnu.ops.survey import survey
 
-    say(f"        {survey(cloud.points, cloud.normals)}")
+    look = survey(cloud.points, cloud.normals)
+    say(f"        {look}")
+    for text in look.warnings():
+        say(f"        {text}")
     run = inference.source(cfg.run, cloud.normals)
     chosen = (
         " (the newest finished one)" if cfg.run == NEWEST else " (comes with pnu)" if run in weights.names() else ""
