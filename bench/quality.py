@@ -17,7 +17,7 @@ import torch
 from torch import nn
 
 from pnu import checkpoint, classical, metrics, surfaces
-from pnu.evaluation import METRICS, Case, Row, source, summarize
+from pnu.evaluation import Case, Row, columns, source, summarize
 from pnu.evaluation.cases import generator
 from pnu.evaluation.report import cell
 from pnu.inference import upsample
@@ -25,7 +25,6 @@ from pnu.io import atomic_path, read_json, write_cloud, write_json, write_mesh
 from pnu.metrics.raycast import closest_points
 from pnu.ops.mesh import vertex_normals
 from pnu.ops.normals import estimate_normals
-from pnu.run.provenance import provenance
 
 
 class Setting(NamedTuple):
@@ -128,10 +127,11 @@ def poisson(cases: list[Case], setting: Setting, methods: list[str], seed: int, 
 
 
 def cloud_lines(rows: list[Row]) -> list[str]:
-    heads = [f"{METRICS[name].head}" for name in COLUMNS]
-    lines = [f"| input | method | {' | '.join(heads)} |", "|---|---|" + "---|" * len(COLUMNS)]
+    shown = [one for one in columns(rows) if one.name in COLUMNS]
+    heads = [one.head for one in shown]
+    lines = [f"| input | method | {' | '.join(heads)} |", "|---|---|" + "---|" * len(shown)]
     for summary in summarize(rows):
-        cells = (cell(summary, name) for name in COLUMNS)
+        cells = (cell(summary, one) for one in shown)
         lines.append(f"| {summary['kind']} | {summary['method']} | {' | '.join(cells)} |")
     return lines
 
@@ -155,8 +155,7 @@ def written(output: Path) -> str:
     lines = [*cloud_lines(rows), "", LEGEND.format(shapes=len({row["shape"] for row in rows}))] if rows else []
     if meshes:
         lines += ["", *surface_lines(meshes), "", "Distances in 1/1000 of the true radius."]
-    made = dict.fromkeys(content["made"] for content in found if "made" in content)
-    return "\n".join([*lines, "", *made]) + "\n"
+    return "\n".join(lines) + "\n"
 
 
 def main() -> None:
@@ -184,7 +183,7 @@ def main() -> None:
         kept = [row for row in content[part] if row["method"] not in {row["method"] for row in new}]
         order = [*METHODS, "input"]
         content[part] = sorted(new + kept, key=lambda row: order.index(row["method"]) if row["method"] in order else -1)
-        write_json(path, content | {"data": found.name, "seed": arguments.seed, "made": provenance([1])})
+        write_json(path, content | {"data": found.name, "seed": arguments.seed})
         print("\n".join((surface_lines if arguments.surfaces else cloud_lines)(new)), flush=True)
     with atomic_path(arguments.output / "quality.md") as path:
         path.write_text(written(arguments.output), encoding="utf-8")

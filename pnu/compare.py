@@ -1,18 +1,19 @@
 """Compare trained networks and classical methods on one page: `python -m pnu.compare methods=[FOLDER,apss]`."""
 
+import functools
 import sys
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pnu.run import command, doc
+from pnu.run import command, doc, find_metric
 from pnu.run.groups import Data
 from pnu.run.progress import steps
-from pnu.run.provenance import provenance
 from pnu.run.quoting import quoted, typed_line
 
 if TYPE_CHECKING:
-    from pnu.evaluation import Case, Upsampler
+    from pnu.evaluation import Case, Source, Upsampler
 
 
 @dataclass
@@ -35,6 +36,8 @@ class Compare:
     ratio: float = doc("points out for each point in")
     passes: bool = doc("also networks that were trained for another ratio: by passes and farthest points")
     normals: str = doc("of the inputs: given, those of the shape; estimate, for which surface_estimated is made")
+    metrics: list[str] = doc("classes of metrics of your own, measured beside pnu's: [mylab.Roughness]")
+    allow: list[str] = doc("packages of your own whose classes may be named, such as [mylab]")
     output: str | None = doc("folder for index.html, metrics.json, metrics.csv, figures/; null: in outputs/comparison/")
     surfaces: list[str] | None = doc("kinds of input whose clouds are made surfaces too; null: the first; []: none")
     shown: int = doc("shapes in the figures and 3D views, the first ones; the tables have all")
@@ -52,9 +55,10 @@ class Compare:
 
 def compare(cfg: Any) -> None:
     check(cfg)
-    from pnu import comparison, evaluation
+    from pnu import comparison, evaluation, metrics
     from pnu.run.folder import versions
 
+    chosen = metrics.with_own(cfg.metrics, functools.partial(find_metric, allow=cfg.allow))
     source = evaluation.source(
         cfg.data, cfg.kinds, part=cfg.part, only=cfg.shapes, points=cfg.points, truth_points=cfg.truth_points,
         seed=cfg.seed, normals=cfg.normals == "given", warn=warn,
@@ -63,6 +67,9 @@ def compare(cfg: Any) -> None:
     if unknown := [kind for kind in rebuilt_kinds if kind not in source.kinds]:
         raise ValueError(f"surfaces={unknown[0]}: expected some of the kinds of input, {', '.join(source.kinds)}")
     methods = upsamplers(cfg)
+    seen = seen_in_training(cfg, source)
+    for text in seen:
+        warn(text)
     output = evaluation.result_folder(cfg.output or Path("outputs", "comparison", source.name))
     shown: dict[tuple[str, str], comparison.Shown] = {}
 
@@ -72,22 +79,22 @@ def compare(cfg: Any) -> None:
             one.clouds[method] = cloud.astype("float32")
 
     with steps(len(source.shapes) * len(source.kinds) * (len(methods) + 1), cfg.quiet) as step:
-        options = {"ratio": cfg.ratio, "seed": cfg.seed, "keep": keep, "step": step}
+        options = {"ratio": cfg.ratio, "seed": cfg.seed, "keep": keep, "step": step, "metrics": chosen}
         rows = list(evaluation.evaluate(methods, source.cases, **options))
     if not cfg.quiet:
-        evaluation.print_tables(rows, f"{', '.join(methods)} on {source.name}")
+        evaluation.print_tables(rows, f"{', '.join(methods)} on {source.name}", chosen)
     with steps(len(shown), cfg.quiet) as step:
         written = comparison.write_comparison(
             output,
             rows,
             list(shown.values()),
             title=f"Point cloud upsampling, {cfg.ratio:g} times: {', '.join(methods)}",
-            head=[evaluation.legend(rows), f"Made by: {typed_line()}", provenance([1])],
-            settings={key: cfg[key] for key in SETTINGS}
-            | {"data": source.name, "versions": versions(), "made": provenance([1])},
+            head=[evaluation.legend(rows), *seen, f"Made by: {typed_line()}"],
+            settings={key: cfg[key] for key in SETTINGS} | {"data": source.name, "versions": versions()},
             rebuilt_kinds=rebuilt_kinds,
             look=comparison.Look(cfg.up, cfg.azimuth, cfg.elevation, cfg.size, cfg.colormap),
             page_mb=cfg.page_mb,
+            metrics=chosen,
             seed=cfg.seed,
             step=step,
         )
@@ -104,14 +111,17 @@ SETTINGS = ("methods", "kinds", "points", "truth_points", "ratio", "normals", "s
 def upsamplers(cfg: Any) -> dict[str, "Upsampler"]:
     """The methods by name. ValueError for one that is neither a run folder nor a classical method, or named twice."""
     from pnu import checkpoint, classical, evaluation, weights
+    from pnu.run.folder import run_name
 
     found: dict[str, Upsampler] = {}
+    names = Counter(run_name(method) for method in cfg.methods if Path(method).is_dir())
     for method in [one for given in cfg.methods for one in runs_of_sweep(given) or [given]]:
         name, _, folder = ("", "", method) if Path(method).exists() else method.rpartition(":")
         if folder in classical.METHODS:
             model, name = classical.method(folder), name or folder
         elif Path(folder).is_dir():
-            model, name = checkpoint.load(folder), name or Path(folder).resolve().name
+            own = run_name(folder)  # the time tells two runs of one name apart
+            model, name = checkpoint.load(folder), name or (own if names[own] < 2 else Path(folder).resolve().name)
         elif weights.find(folder):
             model, name = checkpoint.load(folder), name or Path(folder).stem
         else:
@@ -130,6 +140,27 @@ def upsamplers(cfg: Any) -> dict[str, "Upsampler"]:
             seed=cfg.seed,
         )
     return found
+
+
+def seen_in_training(cfg: Any, source: "Source") -> list[str]:
+    """A line for each network that has seen some of the shapes in its training: those rows are no test of it."""
+    from pnu import classical
+    from pnu.evaluation.trained import trained_on
+
+    lines = []
+    procedural = not cfg.data.get("root")
+    for method in [one for given in cfg.methods for one in runs_of_sweep(given) or [given]]:
+        name, _, folder = ("", "", method) if Path(method).exists() else method.rpartition(":")
+        if folder in classical.METHODS:
+            continue
+        trained = trained_on(folder)
+        if found := trained.of(source.shapes, procedural):
+            listed = ", ".join(found[:8]) + (f" and {len(found) - 8} more" if len(found) > 8 else "")
+            of = f"{len(found)} of the {len(source.shapes)} shapes" + ("" if procedural else ", by their names,")
+            lines.append(f"{name or folder}: was trained on {of} and is not tested by them: {listed}")
+        elif trained.unknown:
+            lines.append(f"{name or folder}: whether these shapes were in its training is not known; {trained.unknown}")
+    return lines
 
 
 def runs_of_sweep(method: str) -> list[str]:

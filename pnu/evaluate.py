@@ -1,14 +1,14 @@
 """Measure a trained network, or a classical method, on whole clouds: `python -m pnu.evaluate run=FOLDER`."""
 
+import functools
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pnu.run import command, doc, shell_line
+from pnu.run import command, doc, find_metric, shell_line
 from pnu.run.groups import Data
 from pnu.run.progress import steps
-from pnu.run.provenance import provenance
 
 NORMALS = {"given": "as given", "estimate": "estimated"}
 DEFAULT = {"given": "surface", "estimate": "surface_estimated"}  # without run= and method=
@@ -38,6 +38,8 @@ class Evaluate:
     passes: bool = doc("also where the network was trained for another ratio: by passes and farthest points")
     normals: str = doc("of the inputs: given, those of the shape; estimate, for which run=surface_estimated is made")
     search: str = doc("for closest surface points. exact; open3d: as other scripts (differs in the faces at edges)")
+    metrics: list[str] = doc("classes of metrics of your own, measured beside pnu's: [mylab.Roughness]")
+    allow: list[str] = doc("packages of your own whose classes may be named, such as [mylab]")
     output: str | None = doc("folder for metrics.json and metrics.csv; null: evaluation/ in the run, or in outputs/")
     save: bool = doc("write the upsampled clouds too, in the frame of the comparison, to the folder's clouds/")
     patch_size: int | None = doc("points of a patch; null: what the network was made for")
@@ -49,10 +51,12 @@ class Evaluate:
 
 def evaluate(cfg: Any) -> None:
     check(cfg)
-    from pnu import checkpoint, classical, evaluation, io
+    from pnu import checkpoint, classical, evaluation, io, metrics
     from pnu.metrics import raycast
     from pnu.ops.surface import closest_points
+    from pnu.run.folder import run_name
 
+    chosen = metrics.with_own(cfg.metrics, functools.partial(find_metric, allow=cfg.allow))
     source = evaluation.source(
         cfg.data, cfg.kinds, part=cfg.part, only=cfg.shapes, points=cfg.points, truth_points=cfg.truth_points,
         seed=cfg.seed, normals=cfg.normals == "given", warn=warn,
@@ -64,7 +68,7 @@ def evaluate(cfg: Any) -> None:
         device=cfg.device, seed=cfg.seed,
     )  # fmt: skip
     is_run = not cfg.method and Path(subject).is_dir()
-    name = Path(subject).name if is_run else Path(subject).stem
+    name = run_name(subject) if is_run else Path(subject).stem
     default = Path(subject, "evaluation") if is_run else Path("outputs", "evaluation", name)
     within = subject if is_run and not cfg.output else None
     output = evaluation.result_folder(cfg.output or default / source.name, within)
@@ -78,14 +82,20 @@ def evaluate(cfg: Any) -> None:
         closest = raycast.closest_points if cfg.search == "open3d" else closest_points
         rows = list(
             evaluation.evaluate(
-                {name: upsampler}, source.cases, ratio=cfg.ratio, seed=cfg.seed, closest=closest, keep=keep, step=step
+                {name: upsampler},
+                source.cases,
+                ratio=cfg.ratio,
+                seed=cfg.seed,
+                closest=closest,
+                keep=keep,
+                step=step,
+                metrics=chosen,
             )
         )
-    made = provenance([1])
-    head = {key: cfg[key] for key in SETTINGS} | {"subject": subject, "data": source.name, "made": made}
-    evaluation.write_results(output, rows, head)
+    head = {key: cfg[key] for key in SETTINGS} | {"subject": subject, "data": source.name}
+    evaluation.write_results(output, rows, head, chosen)
     if not cfg.quiet:
-        evaluation.print_tables(rows, f"{subject}, normals of the input {NORMALS[cfg.normals]}. {made}")
+        evaluation.print_tables(rows, f"{subject}, normals of the input {NORMALS[cfg.normals]}", chosen)
         print(f"output: {output}/metrics.json, metrics.csv{', clouds/' if cfg.save else ''}")
         data = {"data": "meshes", "data.root": cfg.data.root} if cfg.data.get("root") else {}
         rival = "poisson" if subject == "apss" else "apss"

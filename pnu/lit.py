@@ -17,7 +17,7 @@ from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 
 from pnu.checkpoint import write
-from pnu.metrics import CloudMetrics
+from pnu.metrics import METRICS, CloudMetrics, Metric
 from pnu.models.norm import synchronize
 
 Batch = Mapping[str, Any]
@@ -107,6 +107,7 @@ class UpsamplingModule(pl.LightningModule):
         optimizer: called with the parameters.
         scheduler: called with the optimizer, stepped after each step. What it calls `total_steps` or `T_max` is the
             number of steps of the whole training.
+        metrics: of validation and test, those that are for patches.
     """
 
     model: Any  # a network: an nn.Module with outputs()
@@ -117,13 +118,14 @@ class UpsamplingModule(pl.LightningModule):
         loss: nn.Module | None = None,
         optimizer: Callable[..., torch.optim.Optimizer] | None = None,
         scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+        metrics: Sequence[Metric] = METRICS,
     ) -> None:
         super().__init__()
         self.model = model
         self.loss = loss
         self.optimizer, self.scheduler = optimizer, scheduler
         normals = bool(getattr(model, "predicts_normals", True))
-        self.val_metrics, self.test_metrics = CloudMetrics(normals), CloudMetrics(normals)
+        self.val_metrics, self.test_metrics = CloudMetrics(normals, metrics), CloudMetrics(normals, metrics)
         self.micro_batches: list[tuple[dict[str, Tensor], Batch]] = []  # of this step: values and batch
         self.started_at, self.elapsed_s = time.monotonic(), 0.0  # elapsed_s is the same in all processes
 

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from pnu.run import command, doc, shell_line
 from pnu.run.progress import busy
@@ -15,9 +15,13 @@ from pnu.run.progress import busy
 class Reconstruct:
     """Make a triangle mesh from a point cloud file, and measure it against the true surface where there is one."""
 
+    commas: ClassVar = ("columns",)
     input: str = doc("cloud to read: ply, xyz, txt, pcd, obj, off, npy, las, laz, stl, glb, gltf, vtk, vtp or e57")
     output: str = doc("mesh to write: ply (keeps colours and errors), obj, off or stl")
     normals: str = doc("auto: the file's, estimated where it has none; estimate: always estimated")
+    columns: str | None = doc(
+        "of text, or an array without names: x,y,z,_,r,g,b (_ is left out); null: by its names or the usual order"
+    )
     depth: int | None = doc("of the octree, 8 is usual, one more is twice as fine; null: from the points' spacing")
     trim: float = doc("share of the least supported vertices to cut off, for open surfaces, such as 0.05")
     truth: str | None = doc("mesh of the true surface: the error of each vertex is measured, stored and coloured")
@@ -36,15 +40,18 @@ def reconstruct(cfg: Any) -> None:
 
     from pnu import io, surfaces
     from pnu.ops.mesh import open_edges, vertex_normals
+    from pnu.ops.survey import survey
 
     started = time.perf_counter()
     say: Callable[[str], None] = (lambda text: None) if cfg.quiet else print
     check(cfg)
-    points, normals, attributes, notes = io.read_cloud(cfg.input, normals=cfg.normals == "auto")
+    points, normals, attributes, notes = io.read_cloud(cfg.input, normals=cfg.normals == "auto", columns=cfg.columns)
     origin = "with normals" if normals is not None else "normals estimated and oriented"
     say(f"input:  {cfg.input}, {len(points)} points, {origin}")
     for note in notes:
         say(f"        {note}")
+    for text in survey(points, normals).warnings():
+        warn(text)
     truth = None
     if cfg.truth:
         truth = io.read_mesh(cfg.truth)
@@ -81,6 +88,8 @@ def reconstruct(cfg: Any) -> None:
     say(f"output: {cfg.output}, {counts}, {time.perf_counter() - started:.1f} s")
     for note in notes:
         say(f"        {note}")
+    for text in survey(points, normals).warnings():
+        warn(text)
     say(f"next:   {shell_line('picture', inputs=[cfg.input, cfg.output], output='picture.png')}")
 
 

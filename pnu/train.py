@@ -1,11 +1,11 @@
 """Train an upsampling network: `python -m pnu.train [key=value ...]`; `--help` lists the keys."""
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
-from pnu.run import build, closing, command, doc, is_main_process, job_line, objective, open_run
+from pnu.run import build, closing, command, doc, find_metric, is_main_process, job_line, objective, open_run
 from pnu.run.groups import Callbacks, Data, Logger, Loss, Model, Optimizer, Scheduler, Trainer
-from pnu.run.provenance import machine
 
 
 @dataclass
@@ -20,6 +20,8 @@ class Train:
     threads: int | None = doc("threads of a training on the CPU; null: one for each core; small patches want one")
     quiet: bool = doc("print the run folder alone")
     sweep: str | None = doc("name of a sweep (-m) below outputs/sweeps; null: made of the command line")
+    metrics: list[str] = doc("classes of metrics of your own, measured beside pnu's: [mylab.Roughness]")
+    allow: list[str] = doc("packages of your own whose classes may be named, such as [mylab]")
     objective: list[str] | None = doc("validation metrics that a search (hparams_search) makes small")
     data: Data = doc("Data")
     model: Model = doc("Network")
@@ -42,7 +44,7 @@ def train(cfg: Any) -> list[float] | None:
         import lightning.pytorch as pl  # seconds: only once the config is known to be good
         import torch
 
-        from pnu import callbacks, checkpoint, lit, models
+        from pnu import callbacks, checkpoint, lit, metrics, models
 
         lit.quieten()
         lit.keep_threads()
@@ -56,7 +58,10 @@ def train(cfg: Any) -> list[float] | None:
         loss = build(config["loss"], "pnu.losses")
         optimizer = build(config["optimizer"], "torch.optim")
         scheduler = build(config["scheduler"], "torch.optim.lr_scheduler")
-        module = lit.UpsamplingModule(model, loss, optimizer, scheduler)
+        find = functools.partial(find_metric, allow=config.get("allow"))
+        chosen = metrics.with_own(config.get("metrics") or (), find)
+        record["metrics"] = {m.shown.name: m.shown._asdict() for m in chosen if m not in metrics.METRICS}
+        module = lit.UpsamplingModule(model, loss, optimizer, scheduler, chosen)
         trainer = build(
             config["trainer"],
             "lightning.pytorch",
@@ -66,10 +71,10 @@ def train(cfg: Any) -> list[float] | None:
             default_root_dir=run.path,
             **lit.TRAINER_OPTIONS,
         )
-        record |= {"device": str(trainer.strategy.root_device), "machine": machine()}
+        record["device"] = str(trainer.strategy.root_device)
         start = run.last if run.last.exists() else None
         if start is None:
-            run.add_metrics("start" if source else "untrained", trainer.validate(module, data, verbose=False))
+            run.add_metrics("untrained", trainer.validate(module, data, verbose=False))
         trainer.fit(module, data, ckpt_path=start, weights_only=True)
         if run.best.exists():
             module.load_state_dict(checkpoint.read(run.best)["state_dict"])

@@ -26,11 +26,15 @@ class Upsample:
     """Densify a point cloud file with a trained network; `model=NAME` is `run=NAME`."""
 
     also: ClassVar = {"model": "run"}
+    commas: ClassVar = ("columns",)
     input: str = doc("file to read: ply, xyz, txt, pcd, obj, off, npy, las, laz, stl, glb, gltf, vtk, vtp or e57")
     output: str = doc("file to write; its suffix says the format")
     run: str = doc("run folder, or weights that come with pnu: surface, pnu ...; newest: the run that finished last")
     ratio: float = doc("points out for each point in, any number >= 1")
     normals: str = doc("auto: the file's, estimated where it has none; estimate: always estimated")
+    columns: str | None = doc(
+        "of text, or an array without names: x,y,z,_,r,g,b (_ is left out); null: by its names or the usual order"
+    )
     sample: int | None = doc("of a mesh: as many points on its faces, with their normals; null: its vertices")
     patch_size: int | None = doc("points of a patch, at least 16; null: what the network was made for")
     batch_size: int | None = doc("patches (surface: points) at once, bounds the memory; null: by the device")
@@ -53,7 +57,7 @@ def upsample(cfg: Any) -> None:
     if Path(cfg.output).resolve() == Path(cfg.input).resolve():
         raise ValueError(f"output={cfg.output}: is the input; give another name")
     if cfg.sample is None:
-        cloud = io.read_cloud(cfg.input, normals=cfg.normals == "auto")
+        cloud = io.read_cloud(cfg.input, normals=cfg.normals == "auto", columns=cfg.columns)
     else:
         cloud = sampled(cfg.input, cfg.sample, cfg.normals == "auto", cfg.seed)
     origin = "with normals" if cloud.normals is not None else "normals estimated and oriented"
@@ -65,7 +69,10 @@ def upsample(cfg: Any) -> None:
     from pnu.checkpoint import NEWEST
     from pnu.ops.survey import survey
 
-    say(f"        {survey(cloud.points, cloud.normals)}")
+    look = survey(cloud.points, cloud.normals)
+    say(f"        {look}")
+    for text in look.warnings():
+        say(f"        {text}")
     run = inference.source(cfg.run, cloud.normals)
     chosen = (
         " (the newest finished one)" if cfg.run == NEWEST else " (comes with pnu)" if run in weights.names() else ""

@@ -197,7 +197,7 @@ def test_a_method_that_lacks_a_surface_has_no_mean() -> None:
     [
         (["methods=[aps]"], "methods=aps: expected a run folder, or one of apss, poisson, midpoint, ecnet"),
         (["methods=[]"], r"methods=\[\]: expected run folders or classical methods"),
-        (["methods=[apss,apss]"], r"methods=apss: the name apss is taken; give another one, methods=\[NAME:apss\]"),
+        (["methods=[apss,apss]"], r"methods=apss: the name apss is taken; give another one, 'methods=\[.NAME:apss.\]'"),
         (["methods=[truth:apss]"], "the name truth is taken"),
         (["methods=[{place}/runs/first]", "ratio=4"], "was trained for 2; give ratio=2, or passes=true"),
         (["methods=[{place}/meshes]"], "expected a run folder with config.yaml"),

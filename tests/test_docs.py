@@ -1,5 +1,6 @@
 """Every Python block and every command of README.md, docs/ and data/ runs, trainings and measurements shortened."""
 
+import importlib
 import os
 import re
 import shlex
@@ -47,6 +48,16 @@ PRELUDE = "from pnu.io import read_cloud\npoints = read_cloud('scan.ply').points
 
 def text(page: str) -> str:
     return (ROOT / page).read_text(encoding="utf-8")
+
+
+def test_each_thing_of_the_paper_is_where_the_map_says() -> None:
+    named = re.findall(r"`(pnu(?:\.\w+)+)`", text("docs/paper.md"))
+    assert len(named) > 20
+    for name in named:
+        module, _, attribute = name.rpartition(".")
+        assert callable(getattr(importlib.import_module(module), attribute)), name
+    for number in range(1, 8):
+        assert f"Eq. {number}" in text("docs/paper.md")
 
 
 def released_checkpoint(path: Path) -> None:

@@ -84,3 +84,14 @@ def test_what_is_said_of_a_file(tmp_path: Path) -> None:
         "normals are all zero or NaN: taken as none",
     )
     assert read_cloud(tmp_path / "c.ply", normals=False).notes == ("3 of 43 points left out: at the place of another",)
+
+
+def test_degrees_are_told_from_lengths() -> None:
+    """Some kilometers of land in degrees, beside the same in meters and a thin pole."""
+    land = np.random.default_rng(0).random((100, 3)) * [0.02, 0.01, 40] + [11.5, 48.1, 500]
+    (note,) = check_cloud(Cloud(land, None, {}), "c").notes
+    assert "x and y are degrees" in note
+    meters = (land - land[0]) * [74_000, 111_000, 1]
+    pole = land * [5, 10, 0.1]  # 10 cm wide, 4 m high
+    for points in (meters, meters + [5e5, 5e6, 0], pole, POINTS, POINTS * [1, 1, 0], POINTS * [1e-3, 1e-3, 1]):
+        assert check_cloud(Cloud(points, None, {}), "c").notes == ()

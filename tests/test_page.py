@@ -41,7 +41,9 @@ def view(shape: str = "ball", kind: str = "uniform") -> View:
 
 def table(*values: float | None) -> Table:
     rows = [Row(name, [value, 1.0]) for name, value in zip("abcd", values, strict=False)]
-    return Table("Means", [Column("CD"), Column("seconds", 1, best=False)], [*rows, Row("floor", [0.0, None], True)])
+    return Table(
+        "Means", [Column("CD"), Column("seconds", ".1f", best=False)], [*rows, Row("floor", [0.0, None], True)]
+    )
 
 
 def bold(page: str) -> list[str]:
@@ -55,6 +57,13 @@ def test_best_is_bold_as_printed_and_references_do_not_compete(tmp_path: Path) -
     page = (tmp_path / "a.html").read_text()
     assert bold(page) == ["0.500"]
     assert page.count('data-value="">-<') == 3
+
+
+def test_best_is_the_highest_where_higher_is_better(tmp_path: Path) -> None:
+    rows = [Row("a", [1.0, 1.0]), Row("b", [2.0, 2.0])]
+    heads = [Column("up", ".0f", better="higher"), Column("down", ".0f")]
+    write_page(tmp_path / "a.html", "t", {"uniform": [Table("Means", heads, rows)]})
+    assert bold((tmp_path / "a.html").read_text()) == ["1", "2"]
 
 
 def test_words_are_escaped_and_scripts_cannot_be_ended(tmp_path: Path) -> None:

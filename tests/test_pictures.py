@@ -1,5 +1,7 @@
 """Pictures: what is visible, where, in which colour; and figures put together from them."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
@@ -9,8 +11,9 @@ from pnu.io import Mesh
 from pnu.ops.colors import LMS, RGB, linear_light, normal_colors, srgb, value_colors
 from pnu.ops.mesh import corner_normals, split_creases
 from pnu.ops.spacing import spacing
-from pnu.pictures import Camera, ColorBar, figure, look_at, raster, render_cloud, render_mesh, save_png
-from pnu.pictures.figure import extent, ticks
+from pnu.picture import main as picture
+from pnu.pictures import Camera, ColorBar, figure, in_one_place, look_at, raster, render_cloud, render_mesh, save_png
+from pnu.pictures.figure import colorbar_figure, draw_colorbar, extent
 from pnu.pictures.render import in_front
 
 FRONT = Camera(np.eye(3), np.zeros(3), 1.0)
@@ -208,6 +211,36 @@ def test_figure_puts_panels_side_by_side() -> None:
     assert np.flatnonzero(reds.any(1)).mean() > np.flatnonzero(blues.any(1)).mean()  # red = low, at the bottom
 
 
+def test_different_objects_are_each_seen_whole(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A larger one beside the first, through the first's camera, was a few balls that fill the panel, or nothing."""
+    small, large = sphere(2000), sphere(2000)
+    large[:, :3] = 30 * large[:, :3] + [5, 0, 0]
+    noisy = np.vstack([small, small[:1] + [200.0, 0, 0, 0, 0, 0]])  # one point far away: the same place still
+    for name, cloud in (("small", small), ("large", large), ("noisy", noisy)):
+        np.save(tmp_path / f"{name}.npy", cloud)
+
+    def ink(*names: str, **keys: int) -> tuple[list[float], str]:
+        """Share of each panel that is drawn, and what was said."""
+        inputs = ",".join(str(tmp_path / f"{name}.npy") for name in names)
+        more = [f"{key}={value}" for key, value in keys.items()]
+        picture([f"inputs=[{inputs}]", f"output={tmp_path / 'a.png'}", "size=120", *more])
+        drawn = (np.asarray(Image.open(tmp_path / "a.png")) < 250).any(2)
+        width = drawn.shape[1] // len(names)
+        return [float(drawn[:, i * width : (i + 1) * width].mean()) for i in range(len(names))], capsys.readouterr().out
+
+    (first, second), said = ink("small", "large")
+    assert first == pytest.approx(second, rel=0.1)
+    assert "scale:  each panel its own" in said
+    (first, second), said = ink("small", "noisy")
+    assert first == pytest.approx(second, rel=0.1)
+    assert "scale:" not in said
+    (first, second), said = ink("small", "large", fit=0)  # all together
+    assert first < 0.1 < second
+    assert "scale:" not in said
+    assert in_one_place(small, small, noisy)
+    assert not in_one_place(small, small + 3)
+
+
 def test_crop_keeps_all_ink() -> None:
     panel = np.full((50, 50, 3), 255, np.uint8)
     panel[20:30, 10:40] = 0
@@ -235,11 +268,24 @@ def test_save_png(tmp_path) -> None:  # type: ignore[no-untyped-def]
 
 @pytest.mark.parametrize(("low", "high"), [(0, 1), (0, 2.3), (-0.02, 0.07), (100, 1e5), (3.1, 3.2)])
 def test_ticks_are_few_and_round(low: float, high: float) -> None:
-    found = ticks(low, high)
+    axes = colorbar_figure(ColorBar((low, high), "error"), 400, 18).axes[0]
+    found = [place for place in axes.get_yticks() if low - 1e-9 <= place <= high * (1 + 1e-9)]
     assert 4 <= len(found) <= 11
+    assert axes.get_ylabel() == "error"
     assert low - 1e-9 <= found[0]
     assert found[-1] <= high + 1e-9 * high
     np.testing.assert_allclose(np.diff(found), found[1] - found[0])
+
+
+def test_a_color_bar_is_as_high_as_asked_and_cut_to_its_ink() -> None:
+    bar = ColorBar((0, 2), "a label that is far too long for a bar of this height, whatever it says")
+    for height in (80, 331):
+        picture = draw_colorbar(bar, height, 18)
+        assert picture.shape[0] == height
+        ink = np.flatnonzero((picture < 255).any((1, 2)))
+        assert 0 < ink[0] < ink[-1] < height - 1
+        assert 0 < picture.shape[1] < 150
+        np.testing.assert_array_equal(picture, draw_colorbar(bar, height, 18))
 
 
 def test_error_colours_run_from_red_to_blue() -> None:

@@ -165,3 +165,13 @@ def test_a_cloud_whose_every_point_is_repeated(tmp_path: Path, capsys: pytest.Ca
     said = capsys.readouterr().out
     assert "c.ply, 300 points, with normals\n        5700 of 6000 points left out: at the place of another\n" in said
     assert "depth 5," in said  # 11, the deepest, where the spacing seemed zero
+
+
+def test_columns_of_text(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points, normals = np.hsplit(sphere_points(300), 2)
+    np.savetxt(tmp_path / "c.txt", np.hstack([normals, np.ones((300, 1)), points]))
+    given = {"input": tmp_path / "c.txt", "output": tmp_path / "m.ply", "depth": 4}
+    run(reconstruct, **given, columns="nx,ny,nz,_,x,y,z")
+    assert "c.txt, 300 points, with normals\noutput:" in capsys.readouterr().out
+    line = refused(capsys, reconstruct, **given | {"output": tmp_path / "n.ply"}, columns="nx,ny,nz,x,y,z")
+    assert "columns=nx,ny,nz,x,y,z are 6 names, line 1 has 7 columns" in line

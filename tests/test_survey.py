@@ -49,3 +49,42 @@ def test_the_smallest_cloud() -> None:
 def test_noise_is_a_number_where_no_neighbours_look_the_same_way() -> None:
     normals = np.eye(3)[np.arange(20) % 3]  # at most seven of the 16 neighbours have the normal of a place
     assert survey(sphere(20), normals).noise == 0
+
+
+def cube(n: int) -> tuple[np.ndarray, np.ndarray]:
+    axis, side = RNG.integers(0, 3, n), RNG.choice([-1.0, 1.0], n)
+    points, normals = RNG.uniform(-1, 1, (n, 3)), np.zeros((n, 3))
+    points[np.arange(n), axis] = normals[np.arange(n), axis] = side
+    return points, normals
+
+
+def plate(n: int, thickness: float) -> tuple[np.ndarray, np.ndarray]:
+    side = RNG.choice([-1.0, 1.0], n)
+    points = np.column_stack([RNG.uniform(-1, 1, (n, 2)), side * thickness / 2])
+    return points, side[:, None] * [0, 0, 1.0]
+
+
+def test_normals_that_contradict_each_other() -> None:
+    """f of all flipped: 2 f (1 - f) of the pairs. Neither edges nor the two sides of a thin plate do that."""
+    shapes = {"sphere": (sphere(2000),) * 2, "cube": cube(2000), "plate": plate(2000, 0.01)}
+    for points, normals in shapes.values():
+        assert not survey(points, normals).warnings()
+    for name in ("sphere", "cube"):
+        points, normals = shapes[name]
+        for flipped in (0.1, 0.5):
+            wrong = normals * np.where(RNG.random((2000, 1)) < flipped, -1, 1)
+            found = survey(points, wrong)
+            assert found.contradicting == pytest.approx(2 * flipped * (1 - flipped), abs=0.04)
+            (line,) = found.warnings()
+            assert f"{found.contradicting:.0%} of neighbouring normals contradict each other; normals=estimate" in line
+
+
+def test_a_point_far_from_all_others_is_named() -> None:
+    points = sphere(500)
+    assert survey(points).far == 0
+    points[17] = [1e6, 0, 0]
+    found = survey(points)
+    assert (found.far, found.farthest) == (1, 17)
+    assert any(line.startswith("1 of the points lie far from all others (number 18") for line in found.warnings())
+    two = np.vstack([sphere(500), sphere(500) + [9, 0, 0]])  # two things are no outliers
+    assert survey(two).far == 0

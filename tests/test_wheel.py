@@ -72,7 +72,7 @@ def test_the_wheel_holds_what_the_package_reads(wheel: Path) -> None:
     wanted = {f"pnu/{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "conf").rglob("*.yaml")}
     files = [path for path in (ROOT / "pnu").rglob("*") if path.is_file() and "__pycache__" not in path.parts]
     wanted |= {path.relative_to(ROOT).as_posix() for path in files}
-    assert {"pnu/conf/train.yaml", "pnu/py.typed", "pnu/weights/surface.safetensors", "pnu/page/page.html"} <= wanted
+    assert {"pnu/conf/train.yaml", "pnu/py.typed", "pnu/weights/surface.safetensors", "pnu/page/base.html"} <= wanted
     assert wanted - packed == set()
     assert any(name.endswith("licenses/LICENSE") for name in packed)
     assert {name.split("/")[0].partition("-")[0] for name in packed} == {"pnu"}

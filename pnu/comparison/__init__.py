@@ -11,6 +11,7 @@ from pnu import page, pictures
 from pnu.comparison.shapes import Look, Rebuilt, Shown, figure, points_for, rebuild, surface_rows, view
 from pnu.comparison.tables import tables
 from pnu.evaluation import Row, write_results
+from pnu.metrics import METRICS, Metric
 
 __all__ = ["Look", "Shown", "Written", "write_comparison"]
 
@@ -37,6 +38,7 @@ def write_comparison(
     rebuilt_kinds: Sequence[str] = (),
     look: Look = LOOK,
     page_mb: float = 40,
+    metrics: Sequence[Metric] = METRICS,
     seed: int = 0,
     step: Callable[[str], None] = lambda text: None,
 ) -> Written:
@@ -49,9 +51,10 @@ def write_comparison(
         settings: kept in metrics.json.
         rebuilt_kinds: kinds of input whose clouds are made surfaces too, which takes seconds for each.
         page_mb: about the size of the page that is allowed; clouds are thinned to fit.
+        metrics: in the order of the tables.
         step: told what comes next, once for each of `shown`.
     """
-    write_results(folder, rows, settings)
+    write_results(folder, rows, settings, metrics)
     (folder / "figures").mkdir(exist_ok=True)
     rebuilt: list[dict[str, Rebuilt]] = []
     surfaces: list[Row] = []
@@ -72,11 +75,11 @@ def write_comparison(
     points = points_for(page_mb, sum(len(one.clouds) + 1 for one in shown), vertices)
     largest = max((len(cloud) for one in shown for cloud in (*one.clouds.values(), one.case.truth.samples)), default=0)
     views = [view(one, made, points) for one, made in zip(shown, rebuilt, strict=True)]
-    write_results(folder, rows, {**settings, "surfaces": surfaces})
+    write_results(folder, rows, {**settings, "surfaces": surfaces}, metrics)
     size = page.write_page(
         folder / "index.html",
         title,
-        tables(rows, surfaces),
+        tables(rows, surfaces, metrics),
         views,
         head=head,
         foot=notes,

@@ -6,9 +6,12 @@ from typing import Any
 import numpy as np
 
 from pnu import page
-from pnu.evaluation import METRICS, Row, summarize
+from pnu.evaluation import Row, columns, summarize
 from pnu.evaluation.report import REFERENCES, counts
+from pnu.metrics import METRICS, Metric, Shown
+from pnu.metrics.metric import ChamferSq, HausdorffSq
 
+ACROSS = 6  # shapes in a table, twice: more do not fit a window of 1400 pixels
 SURFACE_COLUMNS = {
     "to_truth_mean": ("mean", 1e3),
     "to_truth_rms": ("RMS", 1e3),
@@ -19,49 +22,50 @@ SURFACE_COLUMNS = {
 }
 
 
-def tables(rows: Sequence[Row], surface_rows: Sequence[Row]) -> dict[str, list[page.Table]]:
+def tables(
+    rows: Sequence[Row], surface_rows: Sequence[Row], metrics: Sequence[Metric] = METRICS
+) -> dict[str, list[page.Table]]:
     """For each kind of input: the means of all metrics, the paper's Table 1 (CD and HD of each shape), the surfaces."""
     result = {}
     for kind in dict.fromkeys(row["kind"] for row in rows):
         of_kind = [row for row in rows if row["kind"] == kind]
         made = [row for row in surface_rows if row["kind"] == kind]
         shapes = list(dict.fromkeys(row["shape"] for row in of_kind))
-        found = [means(of_kind, len(shapes)), table_1(of_kind, shapes)]
+        found = [means(of_kind, len(shapes), metrics)]
+        found += [table_1(of_kind, shapes[i : i + ACROSS]) for i in range(0, len(shapes), ACROSS)]
         result[kind] = found + ([surface_table(made)] if made else [])
     return result
 
 
-def means(rows: Sequence[Row], shapes: int) -> page.Table:
-    names = [name for name in METRICS if any(name in row for row in rows)]
-    columns = [page.Column(METRICS[name].head, METRICS[name].digits) for name in names]
+def means(rows: Sequence[Row], shapes: int, metrics: Sequence[Metric]) -> page.Table:
+    all_shown = columns(rows, metrics)
+    heads = [page.Column(shown.head or shown.title, shown.form, better=shown.better) for shown in all_shown]
     body = [
-        page.Row(summary["method"], [scaled(summary, name) for name in names], summary["method"] in REFERENCES)
-        for summary in summarize(rows)
+        page.Row(summary["method"], [scaled(summary, shown) for shown in all_shown], summary["method"] in REFERENCES)
+        for summary in summarize(rows, metrics)
     ]
-    return page.Table(f"Mean of {shapes} shapes, {counts(rows)}", columns, references_last(body))
+    return page.Table(f"Mean of {shapes} shapes, {counts(rows)}", heads, references_last(body))
 
 
 def table_1(rows: Sequence[Row], shapes: Sequence[str]) -> page.Table:
-    metrics = ("chamfer_sq", "hausdorff_sq")
-    columns = [
-        page.Column(shape, METRICS[name].digits, group=METRICS[name].head) for name in metrics for shape in shapes
-    ]
+    both = ChamferSq.shown, HausdorffSq.shown
+    heads = [page.Column(shape, shown.form, group=shown.head) for shown in both for shape in shapes]
     by_place = {(row["method"], row["shape"]): row for row in rows}
     body = [
         page.Row(
             method,
-            [scaled(by_place.get((method, shape), {}), name) for name in metrics for shape in shapes],
+            [scaled(by_place.get((method, shape), {}), shown) for shown in both for shape in shapes],
             method in REFERENCES,
         )
         for method in dict.fromkeys(row["method"] for row in rows)
     ]
-    return page.Table("Each shape, as Table 1 of the paper", columns, references_last(body))
+    return page.Table("Each shape, as Table 1 of the paper", heads, references_last(body))
 
 
 def surface_table(rows: Sequence[Row]) -> page.Table:
     """Means over shapes; a method without a surface of some shape gets none."""
     shapes = {row["shape"] for row in rows}
-    columns = [page.Column(head) for head, _ in SURFACE_COLUMNS.values()]
+    heads = [page.Column(head) for head, _ in SURFACE_COLUMNS.values()]
     body = []
     for method in dict.fromkeys(row["method"] for row in rows):
         own = [row for row in rows if row["method"] == method]
@@ -71,11 +75,11 @@ def surface_table(rows: Sequence[Row]) -> page.Table:
         ]
         body.append(page.Row(method, values, method in REFERENCES))
     caption = "Surfaces reconstructed from the clouds (Poisson), x 1e3 of the true radius; normals in degrees"
-    return page.Table(caption, columns, references_last(body))
+    return page.Table(caption, heads, references_last(body))
 
 
-def scaled(row: Mapping[str, Any], name: str) -> float | None:
-    return METRICS[name].factor * row[name] if name in row else None
+def scaled(row: Mapping[str, Any], shown: Shown) -> float | None:
+    return shown.factor * row[shown.name] if shown.name in row else None
 
 
 def references_last(rows: Sequence[page.Row]) -> list[page.Row]:

@@ -2,18 +2,18 @@
 
 from pnu.evaluation.cases import KINDS, Case, Truth, mesh_cases, pair_cases, truth_of_mesh
 from pnu.evaluation.measure import Row, Upsampler, evaluate, measure, network_upsampler
-from pnu.evaluation.report import METRICS, legend, print_tables, result_folder, summarize, write_results
+from pnu.evaluation.report import columns, legend, print_tables, result_folder, summarize, write_results
 from pnu.evaluation.sources import PARTS, Source, source
 
 __all__ = [
     "KINDS",
-    "METRICS",
     "PARTS",
     "Case",
     "Row",
     "Source",
     "Truth",
     "Upsampler",
+    "columns",
     "evaluate",
     "legend",
     "measure",

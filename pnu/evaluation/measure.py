@@ -1,15 +1,16 @@
 """Run upsamplers on cases and measure what comes out."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import nn
 
-from pnu import inference, metrics
+from pnu import inference
 from pnu.evaluation.cases import Case, Truth, generator
 from pnu.evaluation.cost import Cost
+from pnu.metrics import METRICS, Metric, Pair, measured
 from pnu.metrics.functional import ClosestPoints
 from pnu.ops.normals import complete_normals
 from pnu.ops.surface import closest_points, sample_poisson_disk
@@ -31,6 +32,7 @@ def evaluate(
     closest: ClosestPoints = closest_points,
     keep: Callable[[Case, str, np.ndarray], None] | None = None,
     step: Callable[[str], None] = lambda text: None,
+    metrics: Sequence[Metric] = METRICS,
 ) -> Iterator[Row]:
     """Rows for each case: every method, then two to judge them by.
 
@@ -53,27 +55,25 @@ def evaluate(
             if keep:
                 keep(case, name, cloud)
             counts = {"method": name, "points_in": len(case.points), "points_out": wanted}
-            yield head | counts | measure(cloud, truth, closest) | cost.values
+            yield head | counts | measure(cloud, truth, closest, metrics) | cost.values
         step(f"{truth.shape}, {case.kind}: references")
         if truth.mesh is not None:
             key = truth.shape, wanted
             if key not in floors:
                 other = sample_poisson_disk(truth.mesh, wanted, generator(seed, truth.shape, f"floor {wanted}"))
-                floors[key] = measure(other, truth, closest)
+                floors[key] = measure(other, truth, closest, metrics)
             yield head | {"method": "floor", "points_in": 0, "points_out": wanted} | floors[key]
         cloud = np.hstack([case.points, normals_of(case)])
         counts = {"method": "input", "points_in": len(cloud), "points_out": len(cloud)}
-        yield head | counts | measure(cloud, truth, closest)
+        yield head | counts | measure(cloud, truth, closest, metrics)
 
 
-def measure(cloud: np.ndarray, truth: Truth, closest: ClosestPoints = closest_points) -> dict[str, float]:
+def measure(
+    cloud: np.ndarray, truth: Truth, closest: ClosestPoints = closest_points, metrics: Sequence[Metric] = METRICS
+) -> dict[str, float]:
     """All metrics of a cloud (m, 3 or 6) by name; those that the truth cannot tell are left out."""
-    result = metrics.compare(cloud, truth.samples)
-    if truth.mesh is not None:  # its normals count, not those of the nearest sample
-        result |= metrics.compare_mesh(cloud, truth.mesh, closest=closest)
-    return {name: float(value) for name, value in result.items()} | {
-        "uniformity": float(metrics.uniformity(cloud, truth.samples))
-    }
+    found = measured(Pair(cloud, truth.samples, truth.mesh, closest=closest), metrics)
+    return {name: float(value) for name, value in found.items()}
 
 
 def normals_of(case: Case) -> np.ndarray:

@@ -4,34 +4,18 @@ import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from pnu.evaluation.measure import Row
 from pnu.io import atomic_path, check_writable, write_json
+from pnu.metrics import METRICS, Metric, Shown
 
-
-class Metric(NamedTuple):
-    """How tables show a metric."""
-
-    head: str
-    factor: float
-    digits: int
-
-
-METRICS = {
-    "chamfer_sq": Metric("CD", 1e3, 4),
-    "hausdorff_sq": Metric("HD", 1e3, 3),
-    "p2f": Metric("P2F", 1e3, 3),
-    "normal_deg": Metric("normal", 1, 2),
-    "normal_unsigned_deg": Metric("unsigned", 1, 2),
-    "flipped": Metric("flipped", 100, 2),
-    "spacing_cv": Metric("spacing", 1, 3),
-    "uniformity": Metric("uniform.", 1, 3),
-    "seconds": Metric("s", 1, 2),
-    "peak_memory_mb": Metric("MiB", 1, 0),
-}
+COSTS = (
+    Shown("seconds", "seconds", "s", unit="seconds", form=".2f"),
+    Shown("peak_memory_mb", "memory (MiB)", "MiB", unit="MiB", form=".0f"),
+)
 LEGEND = (
     "CD: mean squared distances, both directions added; HD: largest squared distance; P2F: mean distance to the true "
     "mesh; all three x 1e3, in the {frame}. Normals: mean angle in degrees, signed (0..180) and unsigned (0..90); "
@@ -47,7 +31,13 @@ def legend(rows: Iterable[Row]) -> str:
     return LEGEND.format(frame=f"frame of the truth ({', or '.join(frames)})")
 
 
-def summarize(rows: Iterable[Row]) -> list[Row]:
+def columns(rows: Iterable[Row], metrics: Sequence[Metric] = METRICS) -> list[Shown]:
+    """What the rows have to be shown, in the order of the tables."""
+    found = {name for row in rows for name in row}
+    return [shown for shown in (*(metric.shown for metric in metrics), *COSTS) if shown.name in found]
+
+
+def summarize(rows: Iterable[Row], metrics: Sequence[Metric] = METRICS) -> list[Row]:
     """Mean and spread (standard deviation) over shapes for each kind and method: keys `<metric>` and `<metric>_std`.
 
     A metric that some shape lacks is NaN, never the mean of the others.
@@ -58,39 +48,38 @@ def summarize(rows: Iterable[Row]) -> list[Row]:
     result = []
     for (kind, method), members in groups.items():
         summary: Row = {"kind": kind, "method": method, "shapes": len(members)}
-        for name in METRICS:
-            if any(name in row for row in members):
-                values = np.array([row.get(name, math.nan) for row in members])
-                summary[name] = float(values.mean())
-                summary[f"{name}_std"] = float(values.std(ddof=1)) if len(values) > 1 else math.nan
+        for name in (shown.name for shown in columns(members, metrics)):
+            values = np.array([row.get(name, math.nan) for row in members])
+            summary[name] = float(values.mean())
+            summary[f"{name}_std"] = float(values.std(ddof=1)) if len(values) > 1 else math.nan
         result.append(summary)
     return result
 
 
-def print_tables(rows: Sequence[Row], head: str) -> None:
+def print_tables(rows: Sequence[Row], head: str, metrics: Sequence[Metric] = METRICS) -> None:
     """A table for each kind of input: every shape, then mean and spread, then the references' means."""
     from rich.console import Console
     from rich.table import Table
 
     console = Console(width=max(Console().width, 118), highlight=False)
-    summaries = summarize(rows)
-    names = [name for name in METRICS if any(name in row for row in rows)]
+    summaries = summarize(rows, metrics)
+    all_shown = columns(rows, metrics)
     for kind in dict.fromkeys(row["kind"] for row in rows):
         of_kind = [row for row in rows if row["kind"] == kind]
         table = Table(title=f"{kind}: {counts(of_kind)}", title_justify="left", title_style="bold")
         table.add_column("method")
         table.add_column("shape")
-        for name in names:
-            table.add_column(METRICS[name].head, justify="right")
+        for shown in all_shown:
+            table.add_column(shown.head or shown.title, justify="right")
         for summary in sorted((s for s in summaries if s["kind"] == kind), key=lambda s: s["method"] in REFERENCES):
             method = summary["method"]
             if method not in REFERENCES:
                 for row in of_kind:
                     if row["method"] == method:
-                        table.add_row(method, row["shape"], *(cell(row, name) for name in names))
-            table.add_row(method, "mean", *(cell(summary, name) for name in names), style="bold")
-            spread = {name: summary.get(f"{name}_std", math.nan) for name in names}
-            table.add_row("", "spread", *(cell(spread, name) for name in names), style="dim", end_section=True)
+                        table.add_row(method, row["shape"], *(cell(row, shown) for shown in all_shown))
+            table.add_row(method, "mean", *(cell(summary, shown) for shown in all_shown), style="bold")
+            spread = {shown.name: summary.get(f"{shown.name}_std") for shown in all_shown}
+            table.add_row("", "spread", *(cell(spread, shown) for shown in all_shown), style="dim", end_section=True)
         console.print(table)
     console.print(f"{head}. {legend(rows)}\n")
 
@@ -102,20 +91,21 @@ def counts(rows: Sequence[Row]) -> str:
     return ", ".join(f"{n} -> {m}" for n, m in pairs[:3]) + (" ..." if len(pairs) > 3 else "") + " points"
 
 
-def cell(row: Mapping[str, Any], name: str) -> str:
-    value = row.get(name, math.nan)
-    return "-" if math.isnan(value) else f"{METRICS[name].factor * value:.{METRICS[name].digits}f}"
+def cell(row: Mapping[str, Any], shown: Shown) -> str:
+    return shown.text(row.get(shown.name))
 
 
-def write_results(folder: str | Path, rows: Sequence[Row], head: Mapping[str, Any]) -> None:
+def write_results(
+    folder: str | Path, rows: Sequence[Row], head: Mapping[str, Any], metrics: Sequence[Metric] = METRICS
+) -> None:
     """metrics.json (head, rows, means and spreads) and metrics.csv (rows) in a folder that is there."""
     folder = Path(folder)
-    columns = list(dict.fromkeys(name for row in rows for name in row))
+    names = list(dict.fromkeys(name for row in rows for name in row))
     with atomic_path(folder / "metrics.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns)
+        writer = csv.DictWriter(file, names)
         writer.writeheader()
         writer.writerows(rows)
-    content = {**head, **counted(rows), "legend": legend(rows), "rows": list(rows), "summary": summarize(rows)}
+    content = {**head, **counted(rows), "legend": legend(rows), "rows": list(rows), "summary": summarize(rows, metrics)}
     write_json(folder / "metrics.json", content)
 
 

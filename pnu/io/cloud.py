@@ -10,7 +10,7 @@ from pnu.io.arrays import read_array
 from pnu.io.columns import SKIP, guessed, spelled
 from pnu.io.delimited import read_ptx, read_text
 from pnu.io.e57 import read_e57
-from pnu.io.fields import arranged
+from pnu.io.fields import GEOGRAPHIC, arranged
 from pnu.io.las import read_las
 from pnu.io.mesh import Geometry, read_gltf_mesh, read_obj, read_off, read_stl, read_vtk_mesh
 from pnu.io.pcd import read_pcd
@@ -19,6 +19,7 @@ from pnu.io.text import open_file
 
 TEXTS = (".xyz", ".txt", ".pts", ".asc", ".csv", ".tsv", ".pwn", ".xyzn", ".xyzrgb")
 LARGEST = 1e30  # beyond, squared distances leave the range of float64 or what float32 can hold after scaling
+STEEP = 500  # times that z spans x and y where these are degrees
 LENGTH = 0.05  # by which that of a unit normal may differ from 1, as text rounds it
 
 
@@ -92,8 +93,21 @@ def check_cloud(cloud: Cloud, name: str, *, minimum: int = 16) -> Cloud:
         if len(first) < minimum:
             raise ValueError(f"{name}: holds {len(first)} different points; at least {minimum} are needed")
         cloud = chosen(cloud, first)
+    if GEOGRAPHIC not in notes and looks_geographic(cloud.points):
+        notes.append(f"{GEOGRAPHIC} (so it seems, as z spans more than {STEEP} times as much)")
     normals, found = unit_normals(cloud.normals)
     return Cloud(np.asarray(cloud.points, np.float64), normals, dict(cloud.attributes), (*notes, *found))
+
+
+def looks_geographic(points: np.ndarray) -> bool:
+    """Whether x and y can be degrees beside a z in meters: a few kilometers of land are hundredths of a degree.
+
+    So is a pole of a millimeter's width and a meter's height, far from the origin: nothing else is so steep.
+    """
+    least, most = points.min(axis=0), points.max(axis=0)
+    size, place = most - least, np.maximum(np.abs(least), np.abs(most))
+    inside = place[0] <= 180 and place[1] <= 90 and (place[:2] > 10 * size[:2]).all()
+    return bool(inside and 0 < size[:2].max() < 1 and size[2] > STEEP * size[:2].max())
 
 
 def chosen(cloud: Cloud, rows: np.ndarray) -> Cloud:

@@ -20,11 +20,11 @@ def read_pcd(path: Path) -> dict[str, np.ndarray]:
     try:
         sizes = [int(word) for word in header["SIZE"]]
         counts = [int(word) for word in header.get("COUNT", ["1"] * len(names))]
-        kinds = [KINDS[word] for word in header["TYPE"]]
+        kinds = [KINDS[word.upper()] for word in header["TYPE"]]
         points = int(header["POINTS"][0]) if "POINTS" in header else int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
         fields = list(zip(kinds, sizes, counts, strict=True))
         repeated = any(names.count(name) > 1 for name in names if name != "_")
-        if repeated or len(names) != len(fields) or points < 0 or min(counts) < 1:
+        if repeated or len(names) != len(fields) or points < 0 or min(counts) < 0:
             raise ValueError
         if max(counts) > len(data):  # and numpy would overflow
             raise ValueError
@@ -33,7 +33,7 @@ def read_pcd(path: Path) -> dict[str, np.ndarray]:
         raise ValueError(
             f"{path}: FIELDS, SIZE, TYPE, COUNT and POINTS of the header disagree; save it again"
         ) from None
-    mode = header["DATA"][0]
+    mode = header["DATA"][0].lower()
     if mode == "ascii":
         columns = _text(path, data[start:], points, dtype)
     elif mode == "binary":
@@ -50,7 +50,7 @@ def read_pcd(path: Path) -> dict[str, np.ndarray]:
     found = {
         name: np.ascontiguousarray(column[:, 0] if column.shape[1] == 1 else column)
         for name, column in zip(names, columns, strict=True)
-        if name != "_"  # padding
+        if name != "_" and column.shape[1]  # padding
     }
     if shift is not None:
         found |= {axis: found[axis] + by for axis, by in zip("xyz", shift, strict=True) if axis in found}

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from pnu.metrics.functional import (
     NormalErrors,
+    Pair,
     chamfer_sq,
-    compare,
-    compare_mesh,
     emd_exact,
     hausdorff,
     hausdorff_sq,
@@ -20,6 +19,7 @@ from pnu.metrics.functional import (
     spacing_cv,
     uniformity,
 )
+from pnu.metrics.metric import METRICS, Metric, Shown, compare, compare_mesh, measured, with_own
 
 if TYPE_CHECKING:
     from pnu.metrics.modules import (
@@ -34,13 +34,17 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
+    "METRICS",
     "ChamferDistance",
     "CloudMetrics",
     "EarthMoverDistance",
     "HausdorffDistance",
+    "Metric",
     "NormalError",
     "NormalErrors",
+    "Pair",
     "PointToMesh",
+    "Shown",
     "Spacing",
     "Uniformity",
     "chamfer_sq",
@@ -51,10 +55,12 @@ __all__ = [
     "hausdorff_sq",
     "mean_compute",
     "mean_update",
+    "measured",
     "normal_error",
     "point_to_mesh",
     "spacing_cv",
     "uniformity",
+    "with_own",
 ]
 
 

@@ -8,6 +8,7 @@ An empty cloud, NaN or infinity is a `ValueError`: a failed computation never gi
 A metric over a data set is the mean over clouds: `mean_update` adds sums and counts, `mean_compute` divides them.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -40,31 +41,104 @@ class NormalErrors(NamedTuple):
     flipped: Tensor
 
 
-def chamfer_sq(prediction: Tensor | ArrayLike, target: Tensor | ArrayLike) -> Tensor:
-    """Chamfer distance: mean squared nearest distances to the target and back, added.
+class Pair:
+    """A prediction and the truth; each search is made once, when a metric first asks for it.
+
+    Args:
+        prediction: (n, C) or (B, n, C).
+        target: points of the truth, (m, C), (1, m, C) or (B, m, C), or None.
+        mesh: of the truth, or None; its normals count, not those of the nearest target point.
+        closest: search for the closest points of the mesh.
+    """
+
+    def __init__(
+        self,
+        prediction: Tensor | ArrayLike,
+        target: Tensor | ArrayLike | None = None,
+        mesh: Mesh | None = None,
+        *,
+        closest: ClosestPoints = closest_points,
+    ) -> None:
+        self.target: Tensor | None = None
+        if target is None:
+            self.prediction, self.one = _clouds(prediction, "prediction")
+        else:
+            self.prediction, self.target, self.one = _pair(prediction, target)
+        self.mesh, self.closest = mesh, closest
+
+    @property
+    def has(self) -> set[str]:
+        """What metrics may need: "target", "mesh", "normals" of both."""
+        true = self.mesh is not None or (self.target is not None and self.target.shape[2] >= 6)
+        found = {"target": self.target is not None, "mesh": self.mesh is not None}
+        found["normals"] = true and self.prediction.shape[2] >= 6
+        return {name for name, there in found.items() if there}
+
+    def result(self, values: Tensor) -> Tensor:
+        """values (B,) as they are, or the one value of a single cloud."""
+        return _squeeze(values, self.one)
+
+    @functools.cached_property
+    def forth(self) -> Neighbors:
+        """The nearest target point of each predicted one."""
+        return self._nearest(self.prediction, self.target)
+
+    @functools.cached_property
+    def back(self) -> Neighbors:
+        """The nearest predicted point of each target point."""
+        return self._nearest(self.target, self.prediction)
+
+    @staticmethod
+    def _nearest(queries: Tensor | None, targets: Tensor | None) -> Neighbors:
+        if queries is None or targets is None:
+            raise ValueError("target: expected points of the truth, found none")
+        return nearest(queries[..., :3].contiguous(), targets[..., :3].contiguous())
+
+    @functools.cached_property
+    def on_mesh(self) -> tuple[np.ndarray, Tensor]:
+        """Distance (B, n) of the predicted points to the mesh, and the normals (B, n, 3) of the closest faces."""
+        if self.mesh is None:
+            raise ValueError("mesh: expected the true mesh, found none")
+        found = [self.closest(self.mesh, cloud) for cloud in _numpy(self.prediction)]
+        normals = face_normals(self.mesh)[np.stack([face for _, _, face in found])]
+        return np.stack([distance for _, distance, _ in found]), torch.as_tensor(normals).to(self.prediction)
+
+    @functools.cached_property
+    def angles(self) -> NormalErrors:
+        """Errors of the predicted normals, (B,) each."""
+        if "normals" not in self.has:
+            raise ValueError("normals: expected those of the prediction and of the truth, found only one or none")
+        if self.mesh is not None:
+            reference = self.on_mesh[1]
+        else:
+            assert self.target is not None
+            reference = _take(self.target[..., 3:6], self.forth.idx)
+        return NormalErrors(*_angles(self.prediction[..., 3:6], reference))
+
+
+def chamfer_sq(prediction: Tensor | ArrayLike | Pair, target: Tensor | ArrayLike | None = None) -> Tensor:
+    """Chamfer distance: mean squared nearest distances to the target and back, added. A `Pair` stands for both.
 
     Eq. 1 of the paper with means instead of sums (as in its released code); Fan et al. 2017. Unit: length squared.
 
     >>> float(chamfer_sq([[0.0, 0, 0], [1, 0, 0]], [[0.0, 0, 0]]))
     0.5
     """
-    a, b, one = _pair(prediction, target)
-    forth, back = _both_ways(a, b)
-    return _squeeze(forth.dist_sq.mean(1) + back.dist_sq.mean(1), one)
+    pair = _as_pair(prediction, target)
+    return pair.result(pair.forth.dist_sq.mean(1) + pair.back.dist_sq.mean(1))
 
 
-def hausdorff_sq(prediction: Tensor | ArrayLike, target: Tensor | ArrayLike) -> Tensor:
+def hausdorff_sq(prediction: Tensor | ArrayLike | Pair, target: Tensor | ArrayLike | None = None) -> Tensor:
     """Squared Hausdorff distance: the larger of the two maxima of squared nearest distances. Unit: length squared.
 
     >>> float(hausdorff_sq([[0.0, 0, 0], [2, 0, 0]], [[0.0, 0, 0]]))
     4.0
     """
-    a, b, one = _pair(prediction, target)
-    forth, back = _both_ways(a, b)
-    return _squeeze(torch.maximum(forth.dist_sq.amax(1), back.dist_sq.amax(1)), one)
+    pair = _as_pair(prediction, target)
+    return pair.result(torch.maximum(pair.forth.dist_sq.amax(1), pair.back.dist_sq.amax(1)))
 
 
-def hausdorff(prediction: Tensor | ArrayLike, target: Tensor | ArrayLike) -> Tensor:
+def hausdorff(prediction: Tensor | ArrayLike | Pair, target: Tensor | ArrayLike | None = None) -> Tensor:
     """Hausdorff distance, the root of `hausdorff_sq`. Unit: length.
 
     >>> float(hausdorff([[0.0, 0, 0], [2, 0, 0]], [[0.0, 0, 0]]))
@@ -73,17 +147,18 @@ def hausdorff(prediction: Tensor | ArrayLike, target: Tensor | ArrayLike) -> Ten
     return hausdorff_sq(prediction, target).sqrt()
 
 
-def point_to_mesh(points: Tensor | ArrayLike, mesh: Mesh) -> Tensor:
+def point_to_mesh(points: Tensor | ArrayLike | Pair, mesh: Mesh | None = None) -> Tensor:
     """P2F: mean distance of the points to the surface of a triangle mesh, exact. Unit: length.
 
     >>> triangle = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]]))
     >>> float(point_to_mesh([[0.25, 0.25, 0.5], [0.25, 0.25, -1.5]], triangle))
     1.0
     """
-    return compare_mesh(points, mesh)["p2f"]
+    pair = points if isinstance(points, Pair) else Pair(points, mesh=mesh)
+    return pair.result(pair.prediction.new_tensor(pair.on_mesh[0].mean(1)))
 
 
-def normal_error(prediction: Tensor | ArrayLike, truth: Mesh | Tensor | ArrayLike) -> NormalErrors:
+def normal_error(prediction: Tensor | ArrayLike | Pair, truth: Mesh | Tensor | ArrayLike | None = None) -> NormalErrors:
     """Angle between each predicted normal and the true surface's normal at the closest point of the surface.
 
     truth is a mesh (the normal of the closest face), or a cloud (m, 6) (the normal of the nearest point, for want of a
@@ -93,13 +168,14 @@ def normal_error(prediction: Tensor | ArrayLike, truth: Mesh | Tensor | ArrayLik
     >>> float(error.signed_deg), float(error.unsigned_deg), float(error.flipped)
     (90.0, 0.0, 0.5)
     """
-    cloud, one = _clouds(prediction, "prediction", columns=6)
-    if isinstance(truth, Mesh):
-        found = compare_mesh(prediction, truth)
-        return NormalErrors(found["normal_deg"], found["normal_unsigned_deg"], found["flipped"])
-    target = _expand(_clouds(truth, "truth", columns=6)[0].to(cloud), cloud)
-    reference = _take(target[..., 3:6], nearest(cloud[..., :3], target[..., :3]).idx)
-    return NormalErrors(*(_squeeze(value, one) for value in _angles(cloud[..., 3:6], reference)))
+    if not isinstance(prediction, Pair):
+        _clouds(prediction, "prediction", columns=6)
+        if truth is None:
+            raise ValueError("truth: expected a mesh, or a cloud with normals, found none")
+        if not isinstance(truth, Mesh):
+            _clouds(truth, "truth", columns=6)
+        prediction = Pair(prediction, mesh=truth) if isinstance(truth, Mesh) else Pair(prediction, truth)
+    return NormalErrors(*(prediction.result(value) for value in prediction.angles))
 
 
 def spacing_cv(points: Tensor | ArrayLike) -> Tensor:
@@ -169,49 +245,8 @@ def emd_exact(prediction: Tensor | ArrayLike, target: Tensor | ArrayLike) -> Ten
     return _squeeze(a.new_tensor(values), one)
 
 
-def compare(prediction: Tensor | ArrayLike, target: Tensor | ArrayLike) -> dict[str, Tensor]:
-    """All metrics of two clouds that one search in each direction and one for the spacing can give.
-
-    Returns `chamfer_sq`, `hausdorff_sq`, `spacing_cv`, and where both clouds have normals `normal_deg`,
-    `normal_unsigned_deg` and `flipped`, against the normal of the nearest target point.
-
-    >>> sorted(compare(np.eye(3), np.eye(3)))
-    ['chamfer_sq', 'hausdorff_sq', 'spacing_cv']
-    """
-    a, b, one = _pair(prediction, target)
-    forth, back = _both_ways(a, b)
-    result = {
-        "chamfer_sq": forth.dist_sq.mean(1) + back.dist_sq.mean(1),
-        "hausdorff_sq": torch.maximum(forth.dist_sq.amax(1), back.dist_sq.amax(1)),
-        "spacing_cv": spacing_cv(a),
-    }
-    if a.shape[2] >= 6 and b.shape[2] >= 6:
-        error = _angles(a[..., 3:6], _take(b[..., 3:6], forth.idx))
-        result |= {"normal_deg": error[0], "normal_unsigned_deg": error[1], "flipped": error[2]}
-    return {name: _squeeze(value, one) for name, value in result.items()}
-
-
-def compare_mesh(
-    prediction: Tensor | ArrayLike, mesh: Mesh, *, closest: ClosestPoints = closest_points
-) -> dict[str, Tensor]:
-    """All metrics of a cloud against a mesh that one search for the closest points of its surface can give.
-
-    Returns `p2f`, and where the cloud has normals `normal_deg`, `normal_unsigned_deg` and `flipped`, against the normal
-    of the closest face. Where several faces share the closest point (a point outside a sharp edge), the search chooses
-    which of them counts: `closest` exchanges the search; `raycast.closest_points` is the one that public scripts use.
-
-    >>> sorted(compare_mesh(np.eye(3), Mesh(np.eye(3), np.array([[0, 1, 2]]))))
-    ['p2f']
-    """
-    cloud, one = _clouds(prediction, "prediction")
-    found = [closest(mesh, c) for c in _numpy(cloud)]
-    result = {"p2f": cloud.new_tensor([distance.mean() for _, distance, _ in found])}
-    if cloud.shape[2] >= 6:
-        normals = face_normals(mesh)
-        reference = torch.as_tensor(np.stack([normals[face] for _, _, face in found])).to(cloud)
-        error = _angles(cloud[..., 3:6], reference)
-        result |= {"normal_deg": error[0], "normal_unsigned_deg": error[1], "flipped": error[2]}
-    return {name: _squeeze(value, one) for name, value in result.items()}
+def _as_pair(prediction: Tensor | ArrayLike | Pair, target: Tensor | ArrayLike | None) -> Pair:
+    return prediction if isinstance(prediction, Pair) else Pair(prediction, target)
 
 
 def mean_update(values: Tensor) -> tuple[Tensor, Tensor]:
@@ -262,11 +297,6 @@ def _expand(target: Tensor, prediction: Tensor) -> Tensor:
     if target.shape[0] not in (1, prediction.shape[0]):
         raise ValueError(f"target: expected a batch of {prediction.shape[0]} clouds, found {target.shape[0]}")
     return target.expand(prediction.shape[0], -1, -1)
-
-
-def _both_ways(a: Tensor, b: Tensor) -> tuple[Neighbors, Neighbors]:
-    a, b = a[..., :3].contiguous(), b[..., :3].contiguous()
-    return nearest(a, b), nearest(b, a)
 
 
 def _take(values: Tensor, idx: Tensor) -> Tensor:

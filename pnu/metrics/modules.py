@@ -12,7 +12,7 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from pnu.io import Mesh
-from pnu.metrics import functional
+from pnu.metrics import functional, metric
 from pnu.metrics.functional import mean_compute, mean_update
 
 
@@ -195,11 +195,12 @@ class EarthMoverDistance(CloudMean):
 
 
 class CloudMetrics(CloudMean):
-    """All metrics of two clouds from one search, see `functional.compare`: what training logs.
+    """All metrics of two clouds from one search, see `pnu.metrics.metric`: what training logs.
 
-    Args: normals: whether prediction and target have normals whose error is wanted.
+    Args: normals: whether prediction and target have normals whose error is wanted. metrics: those to choose from; what
+        is for whole clouds, or needs a mesh, is left out.
     Update: prediction (B, n, 6), target (B, m, 6); 3 columns will do without `normals`.
-    Compute: dict of 0-d tensors, means over clouds, with the names of `functional.compare`.
+    Compute: dict of 0-d tensors, means over clouds, by name.
 
     Example:
         >>> metric = CloudMetrics(normals=False)
@@ -208,20 +209,17 @@ class CloudMetrics(CloudMean):
         {'chamfer_sq': tensor(0.5000), 'hausdorff_sq': tensor(1.), 'spacing_cv': tensor(0.)}
     """
 
-    POINTS = ("chamfer_sq", "hausdorff_sq", "spacing_cv")
-    NORMALS = ("normal_deg", "normal_unsigned_deg", "flipped")
-
-    def __init__(self, normals: bool = True, **kwargs: Any) -> None:
+    def __init__(self, normals: bool = True, metrics: Sequence[metric.Metric] = metric.METRICS, **kwargs: Any) -> None:
         if not isinstance(normals, bool):
             raise ValueError(f"normals: expected True or False, found {normals!r}")
-        names = self.POINTS + (self.NORMALS if normals else ())
-        super().__init__(size=(len(names),), **kwargs)
-        self.names = names
+        has = {"target", "normals"} if normals else {"target"}
+        chosen = [one for one in metrics if one.patches and has.issuperset(one.needs)]
+        super().__init__(size=(len(chosen),), **kwargs)
+        self.metrics, self.names = chosen, tuple(one.shown.name for one in chosen)
 
     def update(self, prediction: Tensor, target: Tensor) -> None:
-        values = functional.compare(prediction, target)
-        missing = [name for name in self.names if name not in values]
-        if missing:
+        values = metric.measured(functional.Pair(prediction, target), self.metrics)
+        if len(values) < len(self.names):
             raise ValueError(
                 f"prediction, target: expected 6 columns for the normals' error, found {prediction.shape[-1]}"
                 f" and {target.shape[-1]}; CloudMetrics(normals=False) leaves it out"

@@ -20,6 +20,23 @@ class Camera(NamedTuple):
         return (points - self.center) @ self.rotation.T / self.half_size
 
 
+def in_one_place(first: NDArray, *others: NDArray) -> bool:
+    """Whether clouds `(n, >= 3)` are about as large as the first and where it is, so that one camera shows them all.
+
+    Their boxes, without the farthest 2 % on each side, differ by less than a factor of 2 and half a diagonal.
+    """
+
+    def box(points: NDArray) -> tuple[Array, float]:
+        low, high = np.percentile(points[:, :3], [2, 98], axis=0)
+        return (low + high) / 2, float(np.linalg.norm(high - low))
+
+    center, size = box(first)
+    for other, other_size in map(box, others):
+        if not size / 2 <= other_size <= 2 * size or np.linalg.norm(other - center) > max(size, other_size) / 2:
+            return False
+    return True
+
+
 def look_at(
     *points: NDArray, azimuth: float = 30, elevation: float = 15, up: str = "y", margin: float = 1.04
 ) -> Camera:

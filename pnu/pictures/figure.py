@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,11 @@ from PIL import Image, ImageDraw, ImageFont
 from pnu.io import atomic_path
 from pnu.ops.colors import value_colors
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 Picture = NDArray[np.uint8]
+DPI = 100  # of the color bar: a unit of matplotlib's sizes
 
 
 class ColorBar(NamedTuple):
@@ -109,35 +113,34 @@ def typeface(size: float) -> ImageFont.FreeTypeFont:
     return font
 
 
-def ticks(low: float, high: float) -> list[float]:
-    """Four to eight round numbers within low..high."""
-    step = 10.0 ** np.floor(np.log10((high - low) / 4))
-    step *= next(m for m in (5, 2, 1) if (high - low) / (m * step) >= 3.999)
-    return [float(i * step) for i in range(int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9)) + 1)]
-
-
 def draw_colorbar(bar: ColorBar, height: int, size: float) -> Picture:
-    font = typeface(0.85 * size)
-    numbers = ticks(*bar.limits)
-    digits = max(0, -int(np.floor(np.log10(numbers[1] - numbers[0]) + 1e-9)))
-    labels = [f"{0.0 if number == 0 else number:.{digits}f}" for number in numbers]
-    room = int(max(font.getlength(label) for label in labels))
-    thick, gap, line = int(0.9 * size), int(0.4 * size), int(1.3 * size)
-    length = int(min(0.8 * height, 24 * size))
-    top = (height - length) // 2
-    picture = Image.new("RGB", (gap + thick + gap + room + (line if bar.label else 0) + gap, height), "white")
-    draw = ImageDraw.Draw(picture)
-    values = np.linspace(bar.limits[1], bar.limits[0], length)
-    colors = value_colors(values, bar.limits, bar.colormap)
-    picture.paste(Image.fromarray(np.repeat(colors[:, None], thick, 1)), (gap, top))
-    draw.rectangle((gap, top, gap + thick, top + length), outline="black")
-    for number, label in zip(numbers, labels, strict=True):
-        y = top + length * (bar.limits[1] - number) / (bar.limits[1] - bar.limits[0])
-        draw.line((gap + thick, y, gap + thick + gap // 2, y), "black")
-        draw.text((gap + thick + gap, y), label, "black", font, anchor="lm")
+    """The bar and its label, `height` pixels high, with numbers of `size` pixels; cut to what it needs."""
+    from matplotlib import style
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    with style.context("default"):
+        canvas = FigureCanvasAgg(colorbar_figure(bar, height, size))
+        canvas.draw()
+        picture = np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    return picture[:, : extent([picture], 1, int(0.4 * size))[1]]
+
+
+def colorbar_figure(bar: ColorBar, height: int, size: float) -> "Figure":
+    """The bar as matplotlib draws it, in the middle of a white strip."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import ListedColormap, Normalize
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
+    pixels, length, points = 8 * size, min(0.8 * height, 24 * size), 0.85 * size * 72 / DPI
+    figure = Figure(figsize=(pixels / DPI, height / DPI), dpi=DPI)
+    axes = figure.add_axes((0.4 * size / pixels, (1 - length / height) / 2, 0.9 * size / pixels, length / height))
+    colors = ListedColormap(value_colors(np.linspace(0, 1, 256), (0, 1), bar.colormap) / 255.0)
+    scale = figure.colorbar(ScalarMappable(Normalize(*bar.limits), colors), cax=axes)
+    scale.locator = MaxNLocator(7, steps=[1, 2, 5, 10], min_n_ticks=4)
+    scale.update_ticks()
+    axes.tick_params(labelsize=points)
     if bar.label:
-        text = Image.new("RGB", (height, line), "white")
-        fitted = fitting_font([bar.label], 0.85 * size, int(0.95 * height))
-        ImageDraw.Draw(text).text((height / 2, line / 2), bar.label, "black", fitted, anchor="mm")
-        picture.paste(text.rotate(90, expand=True), (picture.width - line, 0))
-    return np.asarray(picture)
+        fitting = 1.6 * height * 72 / DPI / len(bar.label)  # a letter is about 0.6 of its size wide
+        scale.set_label(bar.label, fontsize=min(points, fitting), parse_math=False)
+    return figure

@@ -64,15 +64,15 @@ class Shape(NamedTuple):
         return render_cloud(cloud, colors, camera=camera, size=size, radius=radius)
 
 
-def read_shape(path: str) -> Shape:
-    """A file with faces as a mesh, any other as a cloud. ValueError as in `pnu.io`."""
+def read_shape(path: str, columns: str | None = None) -> Shape:
+    """A file with faces as a mesh, any other as a cloud. ValueError as in `pnu.io`; columns as in `read_cloud`."""
     suffix = Path(path).suffix.lower()
     if suffix in MESH_SUFFIXES and Path(path).is_file() and len(MESH_READERS[suffix](Path(path)).faces):
         mesh = read_mesh(path)
         # as the file has them, one a vertex: a cloud's points at one place are one
         attributes = CLOUD_READERS[suffix](Path(path)).attributes if suffix in CLOUD_SUFFIXES else {}
         return Shape(path, mesh.vertices, vertex_normals(mesh), mesh, attributes)
-    points, normals, attributes, notes = read_cloud(path, minimum=1)
+    points, normals, attributes, notes = read_cloud(path, minimum=1, columns=columns)
     if normals is not None and np.isnan(normals).any():
         enough = len(points) >= MINIMUM
         normals = complete_normals(torch.from_numpy(points), torch.from_numpy(normals)).numpy() if enough else None

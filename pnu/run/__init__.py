@@ -31,7 +31,7 @@ dataclass and conf/ do not know, also in a multirun, before the function is call
 tracebacks. A field of dataclass type is a group: the keys that any of `conf/<group>/*.yaml` may have.
 """
 
-from pnu.run.build import build
+from pnu.run.build import build, find_metric
 from pnu.run.command import command
 from pnu.run.config import compose_config
 from pnu.run.folder import RunFolder, is_main_process
@@ -47,6 +47,7 @@ __all__ = [
     "command",
     "compose_config",
     "doc",
+    "find_metric",
     "is_main_process",
     "job_line",
     "objective",

@@ -2,7 +2,7 @@
 
 import functools
 import importlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 
@@ -33,6 +33,12 @@ def build(config: Mapping[str, Any] | None, within: str, **more: Any) -> Any:
         return cls(**arguments, **more)
     except TypeError as error:
         raise ValueError(f"{target}: {error}") from error
+
+
+def find_metric(target: str, *, allow: Sequence[str] | None = None) -> type:
+    """The class of a metric: of `pnu.metrics`, or of a package of the user's own that `allow` names."""
+    own = (package for package in allow or () if f"{target}.".startswith(f"{package}."))
+    return find_class(target, next(own, "pnu.metrics"))
 
 
 def find_class(target: str, within: str) -> type:

@@ -22,7 +22,8 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
 
     Args:
         function: gets the checked config; its `ValueError`s and `OSError`s become one line and exit code 2.
-        schema: dataclass that documents every key of `conf/<name>.yaml`; `also` of it: other names of keys.
+        schema: dataclass that documents every key of `conf/<name>.yaml`; `also` of it: other names of keys; `commas`:
+            keys whose values hold commas.
         name: of the config file; default: the schema's name in lower case.
     """
     name = name or schema.__name__.lower()
@@ -42,7 +43,8 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
     def main(argv: Sequence[str] | None = None) -> None:
         # Hydra reads options only before the first override: `a=1 -m b=2` is as good as `-m a=1 b=2`
         given = [
-            renamed(argument, getattr(schema, "also", {})) for argument in (sys.argv[1:] if argv is None else argv)
+            renamed(argument, getattr(schema, "also", {}), getattr(schema, "commas", ()))
+            for argument in (sys.argv[1:] if argv is None else argv)
         ]
         arguments = sorted(given, key=is_override)
         if "--version" in arguments:  # Hydra would tell its own
@@ -131,9 +133,14 @@ def is_override(argument: str) -> bool:
     return not argument.startswith("-") and ("=" in argument or argument.startswith("~"))
 
 
-def renamed(argument: str, names: Mapping[str, str]) -> str:
-    """An argument as Hydra shall see it: the key by its first name, and ~/ expanded, which shells leave after `=`."""
+def renamed(argument: str, names: Mapping[str, str], commas: Sequence[str] = ()) -> str:
+    """An argument as Hydra shall see it: the key by its first name, and ~/ expanded, which shells leave after `=`.
+
+    commas: keys whose values hold commas, which would be several values to Hydra.
+    """
     key, equals, value = argument.partition("=")
+    if key in commas and "," in value and not value.startswith(('"', "'")):
+        value = f'"{value.strip("[] ")}"'
     if value.startswith("~/"):
         value = str(Path(value).expanduser())
     return f"{names.get(key, key)}{equals}{value}"

@@ -11,6 +11,7 @@ import hashlib
 import os
 import platform
 import re
+import shutil
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -92,7 +93,8 @@ def job_folder(config: Mapping[str, Any]) -> RunFolder:
     if folder.read_record().get("status") == "finished":
         folder.skip = "has finished before, skipped"
     if not folder.skip and not folder.last.exists():  # nothing to go on from
-        folder.start_anew()
+        for entry in folder.path.iterdir():
+            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
     choices = hydra.runtime.choices
     folder.facts = {"job": hydra.job.num, "setting": choices.get("setting"), "ablation": choices.get("ablation")}
     return folder

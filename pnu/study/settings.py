@@ -4,7 +4,7 @@ import math
 import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import yaml
 
@@ -13,7 +13,10 @@ from pnu.run.config import flatten
 from pnu.run.folder import UNHASHED, UNHASHED_DATA, RunFolder
 from pnu.run.quoting import shell_line
 from pnu.run.sweep import runs
-from pnu.run.table import SHOWN
+from pnu.run.table import described, shown_in
+
+if TYPE_CHECKING:
+    from pnu.metrics import Shown
 
 REPEATED = ("seed", "data.seed")  # what may differ between the runs of one setting
 
@@ -73,9 +76,19 @@ class Study(NamedTuple):
         return self.settings[0]
 
     @property
+    def described(self) -> dict[str, Any]:
+        """How the metrics of one's own are shown, as the runs' records say."""
+        return {name: entry for s in self.settings for run in s.runs for name, entry in described(run.folder).items()}
+
+    @property
     def metrics(self) -> list[str]:
         """Names of the metrics that any setting has, in the order of the tables."""
-        return [name for name in SHOWN if any(setting.of(name) for setting in self.settings)]
+        results = [run.metrics for setting in self.settings for run in setting.runs]
+        return [shown.name for shown in shown_in(results, self.described)]
+
+    def shown(self, metric: str) -> "Shown":
+        """How a metric of these runs is shown."""
+        return shown_in([{metric: 0.0}], self.described)[0]
 
     def summary(self, setting: Setting, metric: str) -> Summary | None:
         """None where the setting has no such metric."""

@@ -1,10 +1,8 @@
 """A report's files: Markdown, CSV and one HTML page that needs nothing else."""
 
 import csv
-import html
 import io
-from collections.abc import Sequence
-from importlib.resources import files
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +11,9 @@ from PIL import Image
 
 from pnu import page
 from pnu.io import atomic_path
-from pnu.run.provenance import provenance
 from pnu.run.quoting import retyped
-from pnu.run.table import SHOWN
 from pnu.study.pictures import sheets
-from pnu.study.plots import plots
+from pnu.study.plots import Plot, plots
 from pnu.study.settings import Run, Setting, Study, short
 
 READING = (
@@ -37,7 +33,8 @@ def write_report(study: Study, folder: Path) -> list[Path]:
         "report.html": page_html(study, drawn, pictures).encode(),
         "summary.csv": table_csv(summary_rows(study)).encode(),
         "runs.csv": table_csv(run_rows(study)).encode(),
-        **{f"{name}.svg": svg.encode() for name, (_, svg) in drawn.items()},
+        **{f"{name}.svg": plot.svg.encode() for name, plot in drawn.items()},
+        **{f"{name}.png": plot.png for name, plot in drawn.items()},
         **{f"cloud_{shape}.webp": picture for shape, picture in pictures.items()},
     }
     for name, content in contents.items():
@@ -57,13 +54,14 @@ def facts(study: Study) -> list[str]:
     finished = [run for setting in study.settings for run in setting.runs]
     hours = sum(float(run.record.get("wall_s", 0)) for run in finished) / 3600
     counts = sorted({len(setting.runs) for setting in study.settings})
-    known = {key: [str(run.record[key]) for run in finished if run.record.get(key)] for key in ("git", "machine")}
+    revisions = {str(run.record.get("git")) for run in finished}
     seeds = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
     lines = [
         f"{len(study.settings)} settings, {seeds} seeds each, {len(finished)} finished runs, {hours:.2f} hours.",
         f"Baseline: {study.baseline.name}.",
     ]
-    lines.append(provenance(counts, known["git"], known["machine"]))
+    if len(revisions) > 1:
+        lines.append(f"The runs are of {len(revisions)} revisions of the program: {', '.join(sorted(revisions))}.")
     if study.unfinished:
         lines.append(f"{len(study.unfinished)} runs have not finished, see the end.")
     return lines
@@ -73,26 +71,15 @@ def command_of(study: Study) -> str:
     return retyped(str(study.baseline.runs[0].record.get("command", "")))
 
 
-def head(metric: str) -> str:
-    return SHOWN[metric][0]
-
-
-def digits(metric: str) -> str:
-    return SHOWN[metric][2]
-
-
-def cell(study: Study, setting: Setting, metric: str) -> tuple[str, bool]:
-    """Mean, spread and difference as one reads them, and whether the difference exceeds the spread."""
+def cell(study: Study, setting: Setting, metric: str) -> tuple[str, str, bool]:
+    """Mean and spread, difference, as one reads them, and whether the difference exceeds the spread."""
     summary = study.summary(setting, metric)
     if summary is None:
-        return "-", False
-    factor, form = SHOWN[metric][1:]
-    text = format(factor * summary.mean, form)
-    if summary.spread is not None:
-        text += f" ± {format(factor * summary.spread, form)}"
-    if summary.difference is not None:
-        text += f" ({format(factor * summary.difference, '+' + form)})"
-    return text, bool(summary.exceeds)
+        return "-", "", False
+    shown = study.shown(metric)
+    mean = shown.text(summary.mean) + ("" if summary.spread is None else f" ± {shown.text(summary.spread)}")
+    difference = "" if summary.difference is None else f"({shown.text(summary.difference, '+')})"
+    return mean, difference, bool(summary.exceeds)
 
 
 def differing(setting: Setting, baseline: Setting) -> str:
@@ -115,19 +102,24 @@ def status(run: Run) -> str:
     return f"{state}: {run.record.get('error', '')}"
 
 
-def markdown(study: Study, drawn: dict[str, tuple[str, str]], shapes: Sequence[str]) -> str:
+def markdown(study: Study, drawn: Mapping[str, Plot], shapes: Sequence[str]) -> str:
     metrics = study.metrics
     lines = [f"# {study.folder.name}", "", *facts(study), ""]
     if command := command_of(study):
         lines += ["```", command, "```", ""]
-    lines += [READING, "", f"| | setting | {' | '.join(head(metric) for metric in metrics)} | differs in |"]
+    lines += [
+        READING,
+        "",
+        f"| | setting | {' | '.join(study.shown(metric).title for metric in metrics)} | differs in |",
+    ]
     lines.append("|---|---|" + "---:|" * len(metrics) + "---|")
     for i, setting in enumerate(study.settings):
-        cells = [f"**{text}**" if beyond else text for text, beyond in (cell(study, setting, m) for m in metrics)]
+        found = (cell(study, setting, metric) for metric in metrics)
+        cells = [f"**{text}**" if beyond else text for text, beyond in ((f"{m} {d}".strip(), b) for m, d, b in found)]
         differs = "baseline" if i == 0 else differing(setting, study.baseline)
         lines.append(f"| {i} | {setting.name} | {' | '.join(cells)} | {differs} |")
-    for name, (caption, _) in drawn.items():
-        lines += ["", f"## {caption}", "", f"![{caption}]({name}.svg)"]
+    for name, plot in drawn.items():
+        lines += ["", f"## {plot.caption}", "", f"![{plot.caption}]({name}.svg)"]
     if shapes:
         lines += ["", "## The same validation clouds for each setting: input, prediction, target; colours are normals"]
     for shape in shapes:
@@ -137,51 +129,32 @@ def markdown(study: Study, drawn: dict[str, tuple[str, str]], shapes: Sequence[s
     return "\n".join(lines) + "\n"
 
 
-def page_html(study: Study, drawn: dict[str, tuple[str, str]], pictures: dict[str, bytes]) -> str:
-    parts = [page.paragraphs(facts(study))]
-    if command := command_of(study):
-        parts.append(f"<pre>{html.escape(command)}</pre>")
-    parts.append(page.paragraphs([READING]))
-    parts.append(table_html(study))
-    for caption, svg in drawn.values():
-        parts.append(f"<h2>{html.escape(caption)}</h2>\n<figure>{svg}</figure>")
-    if pictures:
-        parts.append("<h2>The same validation clouds for each setting</h2>")
-        parts.append(page.paragraphs(["Input, prediction and target of the first seed; colours are normals."]))
-    parts += [page.figure(shape, picture) for shape, picture in pictures.items()]
-    if study.unfinished:
-        items = "".join(f"<li>{html.escape(text)}</li>" for text in failures(study))
-        parts.append(f'<h2>Runs that have not finished</h2><ul class="failures">{items}</ul>')
-    values = {
-        "title": html.escape(study.folder.name),
-        "style": files("pnu.page").joinpath("style.css").read_text("utf-8"),
-        "sort": files("pnu.page").joinpath("sort.js").read_text("utf-8"),
-        "body": "\n".join(parts),
-    }
-    first, *rest = files(__package__).joinpath("page.html").read_text("utf-8").split("{{")
-    return first + "".join(values[name] + after for name, _, after in (part.partition("}}") for part in rest))
+def page_html(study: Study, drawn: Mapping[str, Plot], pictures: Mapping[str, bytes]) -> str:
+    return page.render(
+        "report.html",
+        title=study.folder.name,
+        head=facts(study),
+        command=command_of(study),
+        reading=READING,
+        settings=settings_table(study),
+        plots=list(drawn.values()),
+        pictures={shape: page.data_url(picture) for shape, picture in pictures.items()},
+        failures=failures(study),
+    )
 
 
-def table_html(study: Study) -> str:
+def settings_table(study: Study) -> page.Set:
     """Sorted by a click on a head: numbers by their means."""
-    heads = "".join(f'<th scope="col">{html.escape(head(metric))}</th>' for metric in study.metrics)
     rows = []
     for i, setting in enumerate(study.settings):
         cells = []
         for metric in study.metrics:
-            text, beyond = cell(study, setting, metric)
-            kind = ' class="beyond"' if beyond else ""
-            value = repr(setting.mean(metric)) if setting.of(metric) else ""
-            cells.append(f'<td{kind} data-value="{value}">{html.escape(text)}</td>')
-        name = f"{i} {setting.name}"
-        title = "baseline" if i == 0 else differing(setting, study.baseline)
-        reference = ' class="reference"' if i == 0 else ""
-        first = f'<td data-value="{i}" title="{html.escape(title)}">{html.escape(name)}</td>'
-        rows.append(f"<tr{reference}>{first}{''.join(cells)}</tr>")
-    return (
-        '<div class="scroll"><table class="sortable"><thead><tr><th scope="col">setting</th>'
-        f"{heads}</tr></thead>\n<tbody>\n{chr(10).join(rows)}\n</tbody></table></div>"
-    )
+            mean, difference, beyond = cell(study, setting, metric)
+            key = page.sort_key(setting.mean(metric)) if setting.of(metric) else ""
+            cells.append(page.Cell(mean, key, "beyond" if beyond else "", difference))
+        hint = "baseline" if i == 0 else differing(setting, study.baseline)
+        rows.append(page.Line(f"{i} {setting.name}", cells, i == 0, str(i), hint))
+    return page.Set("", "setting", [study.shown(metric).title for metric in study.metrics], rows)
 
 
 def summary_rows(study: Study) -> list[dict[str, Any]]:
