@@ -12,13 +12,14 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from omegaconf import OmegaConf
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch.utils.tensorboard.summary import hparams
 
 from pnu.checkpoint import read, write
 from pnu.ops.colors import normal_colors
 from pnu.pictures import figure, look_at, render_cloud, save_png
 from pnu.run import RunFolder, build
+from pnu.runtime.progress import bar
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -123,7 +124,7 @@ class ProgressBar(pl.Callback):
         if not trainer.is_global_zero:
             return
         total = trainer.estimated_stepping_batches
-        self.bar = Progress(
+        self.bar = bar(
             TextColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from pnu.run import command, doc, find_metric
 from pnu.run.groups import Data
-from pnu.run.progress import steps
 from pnu.run.quoting import quoted, typed_line
+from pnu.runtime.progress import steps
 
 if TYPE_CHECKING:
     from pnu.evaluation import Case, Source, Upsampler

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from pnu.run import command, doc, find_metric, shell_line
 from pnu.run.groups import Data
-from pnu.run.progress import steps
+from pnu.runtime.progress import steps
 
 NORMALS = {"given": "as given", "estimate": "estimated"}
 DEFAULT = {"given": "surface", "estimate": "surface_estimated"}  # without run= and method=

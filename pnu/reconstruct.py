@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from pnu.run import command, doc, shell_line
-from pnu.run.progress import busy
+from pnu.runtime.progress import busy
 
 
 @dataclass

@@ -7,13 +7,13 @@ import shutil
 import sys
 import time
 import types
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pnu.run import command, doc, shell_line
+from pnu.runtime.progress import stages
 
 if TYPE_CHECKING:
     from pnu.io import Cloud
@@ -82,7 +82,7 @@ def upsample(cfg: Any) -> None:
     parts = Path(f"{cfg.output}.parts") if cfg.ratio * len(cloud.points) >= LONG else None
     if parts is not None and parts.is_dir():
         say(f"parts:  {parts}, of an earlier start; what fits is taken")
-    with progress_bar(cfg.quiet) as progress:
+    with stages(cfg.quiet) as progress:
         dense = inference.upsample(
             cloud.points,
             cloud.normals,
@@ -128,29 +128,6 @@ def sampled(path: str, count: int, normals: bool, seed: int) -> "Cloud":
         raise ValueError(f"{path}: {error}") from None
     note = f"a mesh: the points are on its {len(mesh.faces)} faces, not its {len(mesh.vertices)} vertices"
     return io.Cloud(points[:, :3], points[:, 3:] if normals else None, {}, (note,))
-
-
-@contextmanager
-def progress_bar(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """A bar on stderr for each stage, with the time left."""
-    from rich.console import Console
-    from rich.progress import Progress, TaskID
-
-    tasks: dict[str, TaskID] = {}
-    bar = Progress(console=Console(stderr=True), disable=quiet)
-
-    def progress(stage: str, done: int, total: int) -> None:
-        known = total if total > 1 or done else None  # a single step has no middle to show
-        if stage not in tasks:
-            bar.start()  # not before: an error that comes first stands alone
-            tasks[stage] = bar.add_task(stage, total=known)
-        bar.update(tasks[stage], completed=done, total=known)
-
-    try:
-        yield progress
-    finally:
-        if tasks:
-            bar.stop()
 
 
 class _Callable(types.ModuleType):

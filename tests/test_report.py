@@ -20,6 +20,9 @@ import pytest
 import yaml
 from PIL import Image
 
+from pnu.comparison.tables import tables
+from pnu.metrics import METRICS
+from pnu.page import write_page
 from pnu.report import main
 from pnu.study import collect, write_report
 from pnu.study.plots import front, logarithmic, plots
@@ -284,6 +287,46 @@ def test_page_in_a_browser(swept: Path, tmp_path: Path) -> None:
     assert all(text.startswith("true/") and int(text[5:]) >= 2 for text in found["drawn"])
     assert found["pictures"] == [True]
     assert found["sorted"]
+
+
+@needs_browser
+@pytest.mark.slow
+def test_tables_fit_a_window_of_1400_pixels(make: Make, tmp_path: Path) -> None:
+    """Twenty settings with long names, all metrics, three-digit numbers; and a comparison of fourteen shapes."""
+    for job in range(40):
+        folder = make(
+            job,
+            f"a/no_{'_and_no_'.join(['point_knn', 'normal_orth'])}_{job // 2}",
+            job % 2,
+            0.1 + 0.01 * job,
+            w3=job // 2,
+        )
+        found = {
+            "hausdorff_sq": 0.5,
+            "spacing_cv": 0.4,
+            "normal_deg": 123.4,
+            "normal_unsigned_deg": 67.8,
+            "flipped": 0.5,
+        }
+        (folder / f"{job}" / "metrics.json").write_text(json.dumps({"test": {"chamfer_sq": 0.1 + 0.01 * job} | found}))
+    main([f"sweep={folder}", f"output={tmp_path / 'out'}", "quiet=true"])
+    names = [metric.shown.name for metric in METRICS] + ["seconds", "peak_memory_mb"]
+    rows = [
+        {"kind": "uniform", "method": method, "shape": f"od_pulley_modification_{i}", "points_in": 5000,
+         "points_out": 20000} | dict.fromkeys(names, 0.1234)
+        for method in ("a_run_with_a_long_name_of_its_own", "apss", "input") for i in range(14)
+    ]  # fmt: skip
+    write_page(tmp_path / "out" / "index.html", "Comparison", tables(rows, []))
+    probe = """<script>
+      const wide = [...document.querySelectorAll(".scroll")].filter((box) => box.scrollWidth > box.clientWidth);
+      const root = document.documentElement;
+      document.title = JSON.stringify([innerWidth, root.scrollWidth <= root.clientWidth, wide.length]);
+    </script></body>"""
+    for name in ("report", "index"):
+        page = tmp_path / f"{name}_probe.html"
+        page.write_text((tmp_path / "out" / f"{name}.html").read_text().replace("</body>", probe))
+        done = browse(page, tmp_path / f"profile_{name}", "--window-size=1400,1800", "--dump-dom")
+        assert json.loads(re.search(r"<title>(.*?)</title>", done.stdout)[1])[1:] == [True, 0], name  # type: ignore[index]
 
 
 @needs_browser

@@ -16,6 +16,7 @@ from pnu.data.augment import from_options
 from pnu.data.dataset import Downsampling, EpochSampler, Options, PatchDataset, check_options, split
 from pnu.data.patchset import build, check
 from pnu.io import Mesh, meshes_of, read_mesh
+from pnu.runtime.progress import counted
 
 
 class EpochDataModule(pl.LightningDataModule):
@@ -207,15 +208,9 @@ class GeneratedDataModule(PatchDataModule):
             processes = min(cores, 8, 1 + len(makers) // 8)  # to start one takes as long as several shapes
             build(
                 path, makers, self.patches, seed=self.shape_seed, parameters=parameters, processes=processes,
-                progress=None if self.quiet else functools.partial(bar, description=f"cut patches into {path}"),
+                progress=None if self.quiet else functools.partial(counted, description=f"cut patches into {path}"),
             )  # fmt: skip
         return path
-
-
-def bar(results: Iterable[Any], total: int, description: str) -> Iterable[Any]:
-    from rich.progress import track
-
-    return track(results, description, total)
 
 
 class SyntheticDataModule(GeneratedDataModule):
