@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from pnu import checkpoint, classical, metrics, surfaces
+from pnu import checkpoint, metrics, surfaces
 from pnu.evaluation import Case, Row, columns, source, summarize
 from pnu.evaluation.cases import generator
 from pnu.evaluation.report import cell
@@ -25,6 +25,7 @@ from pnu.io import atomic_path, read_json, write_cloud, write_json, write_mesh
 from pnu.metrics.raycast import closest_points
 from pnu.ops.mesh import vertex_normals
 from pnu.ops.normals import estimate_normals
+from pnu.upsamplers import CLASSICAL, Upsampler, classical
 
 
 class Setting(NamedTuple):
@@ -51,7 +52,7 @@ SETTINGS = {
     "x8": Setting("normals given, x8", given=True, ratio=8),
     "x16": Setting("normals given, x16", given=True, ratio=16),
 }
-METHODS = ("surface", *classical.METHODS)
+METHODS = ("surface", *CLASSICAL)
 COLUMNS = ("chamfer_sq", "hausdorff_sq", "p2f", "normal_unsigned_deg", "flipped", "spacing_cv")
 ERRORS = ("to_truth_mean", "to_truth_rms", "to_truth_max", "from_truth_mean", "from_truth_max", "normal_deg_mean")
 LEGEND = (
@@ -78,10 +79,10 @@ def inputs(cases: Iterator[Case], setting: Setting, seed: int) -> Iterator[Case]
         yield Case(setting.title, points, normals, case.truth)
 
 
-def network(method: str, setting: Setting) -> nn.Module:
+def network(method: str, setting: Setting) -> nn.Module | Upsampler:
     """A classical method, or weights or a run; "surface" takes the weights for the normals of the setting."""
-    if method in classical.METHODS:
-        return classical.method(method)
+    if method in CLASSICAL:
+        return classical(method)
     return checkpoint.load("surface_estimated" if method == "surface" and not setting.given else method)
 
 

@@ -4,29 +4,27 @@ A *cloud* is an `(n, 6)` array of points and unit normals; an *upsampler* turns 
 
     import pnu
     dense = pnu.upsample(points, ratio=4)       # (n, 3), or (n, 6) with normals -> (4 n, 6)
+    normals = pnu.normals(points)               # (n, 3) -> (n, 3), oriented
     network = pnu.load("outputs/...")           # a trained network, in eval mode
 """
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "load", "upsample"]
+__all__ = ["__version__", "load", "normals", "upsample"]
 
 if TYPE_CHECKING:
     from pnu.checkpoint import load
-    from pnu.inference import upsample
+    from pnu.inference import normals, upsample
+
+HOMES = {"load": "pnu.checkpoint", "normals": "pnu.inference", "upsample": "pnu.inference"}
 
 
 def __getattr__(name: str) -> Any:
     """Import the public functions on first use, so that `import pnu` stays instant."""
-    if name == "load":
-        from pnu.checkpoint import load
-
-        return load
-    if name == "upsample":
-        from pnu.inference import upsample
-
-        return upsample
+    if name in HOMES:
+        return getattr(importlib.import_module(HOMES[name]), name)
     raise AttributeError(f"module 'pnu' has no attribute {name!r}")
 
 

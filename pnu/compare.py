@@ -13,7 +13,7 @@ from pnu.run.quoting import quoted, typed_line
 from pnu.runtime.progress import steps
 
 if TYPE_CHECKING:
-    from pnu.evaluation import Case, Source, Upsampler
+    from pnu.evaluation import Case, Method, Source
 
 
 @dataclass
@@ -108,24 +108,26 @@ def compare(cfg: Any) -> None:
 SETTINGS = ("methods", "kinds", "points", "truth_points", "ratio", "normals", "seed")
 
 
-def upsamplers(cfg: Any) -> dict[str, "Upsampler"]:
+def upsamplers(cfg: Any) -> dict[str, "Method"]:
     """The methods by name. ValueError for one that is neither a run folder nor a classical method, or named twice."""
-    from pnu import checkpoint, classical, evaluation, weights
+    from pnu import checkpoint, evaluation, weights
     from pnu.run.folder import run_name
+    from pnu.upsamplers import CLASSICAL, classical
 
-    found: dict[str, Upsampler] = {}
+    found: dict[str, Method] = {}
     names = Counter(run_name(method) for method in cfg.methods if Path(method).is_dir())
     for method in [one for given in cfg.methods for one in runs_of_sweep(given) or [given]]:
         name, _, folder = ("", "", method) if Path(method).exists() else method.rpartition(":")
-        if folder in classical.METHODS:
-            model, name = classical.method(folder), name or folder
+        model: Any
+        if folder in CLASSICAL:
+            model, name = classical(folder), name or folder
         elif Path(folder).is_dir():
             own = run_name(folder)  # the time tells two runs of one name apart
             model, name = checkpoint.load(folder), name or (own if names[own] < 2 else Path(folder).resolve().name)
         elif weights.find(folder):
             model, name = checkpoint.load(folder), name or Path(folder).stem
         else:
-            known = ", ".join([*classical.METHODS, *weights.names()])
+            known = ", ".join([*CLASSICAL, *weights.names()])
             raise ValueError(f"methods={method}: expected a run folder, or one of {known}; found neither")
         if name in found or name in ("input", "floor", "truth"):
             cure = quoted("methods", [f"NAME:{folder}"])
@@ -144,14 +146,14 @@ def upsamplers(cfg: Any) -> dict[str, "Upsampler"]:
 
 def seen_in_training(cfg: Any, source: "Source") -> list[str]:
     """A line for each network that has seen some of the shapes in its training: those rows are no test of it."""
-    from pnu import classical
     from pnu.evaluation.trained import trained_on
+    from pnu.upsamplers import CLASSICAL
 
     lines = []
     procedural = not cfg.data.get("root")
     for method in [one for given in cfg.methods for one in runs_of_sweep(given) or [given]]:
         name, _, folder = ("", "", method) if Path(method).exists() else method.rpartition(":")
-        if folder in classical.METHODS:
+        if folder in CLASSICAL:
             continue
         trained = trained_on(folder)
         if found := trained.of(source.shapes, procedural):

@@ -51,10 +51,11 @@ class Evaluate:
 
 def evaluate(cfg: Any) -> None:
     check(cfg)
-    from pnu import checkpoint, classical, evaluation, io, metrics
+    from pnu import checkpoint, evaluation, io, metrics
     from pnu.metrics import raycast
     from pnu.ops.surface import closest_points
     from pnu.run.folder import run_name
+    from pnu.upsamplers import classical
 
     chosen = metrics.with_own(cfg.metrics, functools.partial(find_metric, allow=cfg.allow))
     source = evaluation.source(
@@ -62,7 +63,7 @@ def evaluate(cfg: Any) -> None:
         seed=cfg.seed, normals=cfg.normals == "given", warn=warn,
     )  # fmt: skip
     subject = cfg.method or str(checkpoint.resolve(cfg.run or DEFAULT[cfg.normals]))
-    model = classical.method(subject) if cfg.method else checkpoint.load(subject)
+    model = classical(subject) if cfg.method else checkpoint.load(subject)
     upsampler = evaluation.network_upsampler(
         model, cfg.ratio, passes=cfg.passes, name=subject, patch_size=cfg.patch_size, batch_size=cfg.batch_size,
         device=cfg.device, seed=cfg.seed,

@@ -2,52 +2,32 @@
 
 import copy
 import hashlib
-import math
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from functools import partial
+from dataclasses import replace
 from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from pnu import __version__, checkpoint
 from pnu.io import Cloud, check_cloud
-from pnu.models.surface import Surface
-from pnu.ops import patches
 from pnu.ops.attributes import carry
-from pnu.ops.nearest import nearest
 from pnu.ops.normalize import Frame, unit_sphere_frame
-from pnu.ops.normals import complete_normals, estimate_normals, flip_to_reference
-from pnu.runtime import threads
-from pnu.runtime.parts import Keep, Parts, forget
-from pnu.runtime.progress import Progress
-from pnu.runtime.workers import Begin, Here, Processes, Work, Workers
+from pnu.ops.normals import complete_normals, estimate_normals
+from pnu.runtime.parts import Parts
+from pnu.runtime.progress import Progress, silent
+from pnu.runtime.workers import Processes
+from pnu.upsamplers import CLASSICAL, Context, Upsampler, classical, upsampler_of
+from pnu.upsamplers.patches import with_unit_normals
 
 MINIMUM = 16  # points of a cloud
-SMALLEST_PATCH = 64  # points that every network accepts; a smaller cloud is repeated up to it
 LARGEST = 10**9  # points of an output
-SLACK = 1.1  # growth beyond the network's ratio for which overlapping patches have points enough
-KEPT = 256  # patches whose predictions are kept in one file
-BATCHES = 32  # on a CPU, that its threads share
-ZERO = 1e-6  # predicted normals shorter than this have no direction
-
-
-@runtime_checkable
-class CloudUpsampler(Protocol):
-    """A procedure for whole clouds. A model that has one of its own gets no patches.
-
-    upsample_cloud(cloud (n, 6) float64 in the unit sphere, on the model's device, count) -> (count, 6), or (count, 3)
-    without normals, in the same frame. All randomness comes from the generator; batch_size bounds the memory.
-    """
-
-    def upsample_cloud(
-        self, cloud: Tensor, count: int, *, batch_size: int | None, generator: torch.Generator, progress: Progress
-    ) -> Tensor: ...
 
 
 def upsample(
@@ -55,22 +35,19 @@ def upsample(
     normals: np.ndarray | None = None,
     *,
     ratio: float = 4,
-    model: nn.Module | str | PathLike[str] = "surface",
+    model: nn.Module | Upsampler | str | PathLike[str] = "surface",
     patch_size: int | None = None,
     device: str = "auto",
     devices: int = 1,
     batch_size: int | None = None,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     parts: str | PathLike[str] | None = None,
 ) -> np.ndarray:
     """A denser cloud on the same surface.
 
-    A network of patches is used as in the paper (section Inference): patches around farthest points are brought to the
-    unit sphere, go through the network and back, and farthest points of all predictions are kept. In addition every
-    input point lies in a patch, passes are repeated for ratios beyond the network's, and a cloud of fewer than 64
-    points fills a patch by repetition. A `CloudUpsampler`, such as "surface", takes the cloud as a whole. The result
-    depends neither on the order of the points nor on repeated ones.
+    Networks of patches are used as in the paper (`pnu.upsamplers.patches`); "surface" and upsamplers without a network
+    take the cloud as a whole. Neither the order of the points nor repeated ones have an influence.
 
     Args:
         points: (n, 3), or (n, 6) with normals, n >= 16, in any unit and anywhere; an array, or a tensor on any device.
@@ -78,9 +55,9 @@ def upsample(
             `pnu.io.check_cloud` tells what it finds.
         normals: (n, 3), of any length; estimated and oriented where missing, zero or NaN here and in points.
         ratio: points out for each point in, any number >= 1.
-        model: network, run folder, file of weights, the name of weights that come with pnu (`pnu.weights`), or
-            "newest", the run that finished last under outputs/. "surface" takes the weights made for estimated normals
-            where none are given.
+        model: network, run folder, file of weights, the name of weights that come with pnu (`pnu.weights`), "newest",
+            the run that finished last under outputs/, or an upsampler: "apss", "poisson", "midpoint", or one's own.
+            "surface" takes the weights made for estimated normals where none are given.
         patch_size: points of a patch, at least 16; None: what the network was made for. "surface" has no patches.
         device: "auto" (where the given network is; else CUDA where there is one), "cpu", "cuda", "cuda:1" ...
         devices: CUDA devices, or processes on the CPU, that share the work of the network; the result is the same for
@@ -99,7 +76,6 @@ def upsample(
 
     The network comes back as it was, modes and device too; generators and settings of torch are left alone.
     """
-    progress = progress or (lambda stage, done, total: None)
     given = _given(points, normals)
     count = output_count(len(given.points), ratio)
     sizes = (
@@ -111,26 +87,20 @@ def upsample(
     for name, value, least in sizes:
         if value is not None and not (isinstance(value, Integral) and value >= least):
             raise ValueError(f"{name}={value}: expected a whole number >= {least}")
-    network, target = _on_device(model if isinstance(model, nn.Module) else source(model, given.normals), device)
-    upsampler = _upsampler(network, patch_size)
-    sparse, frame = _prepare(given, progress)
-    generator = torch.Generator().manual_seed(seed)
-    options: dict[str, Any] = {}
-    in_parts = isinstance(upsampler, Surface | Patchwise)
-    if parts is not None and in_parts:
-        options["keep"] = Parts(Path(parts) / _digest(network, sparse, count, upsampler))
-    if devices > 1 and not in_parts:
+    network, target = _on_device(*_model(model, given.normals), device)
+    upsampler = upsampler_of(network, patch_size)
+    if devices > 1 and not getattr(upsampler, "parallel", False):
         raise ValueError(f"devices={devices}: {type(network).__name__} works in one process; leave devices=1")
     names = _names(target, devices)
+    sparse, frame = _prepare(given, progress)
+    finished = Parts() if parts is None else Parts(Path(parts) / _digest(network, sparse, count, upsampler))
+    context = Context(target, batch_size, torch.Generator().manual_seed(seed), progress, finished)
     with torch.no_grad(), evaluating(network), ExitStack() as stack:
         if torch.get_default_device().type != "cpu":
             stack.enter_context(torch.device("cpu"))
         if devices > 1:
-            make = partial(_begin, copy.deepcopy(network).cpu(), patch_size, batch_size)
-            options["workers"] = stack.enter_context(Processes(make, names))
-        raw = upsampler.upsample_cloud(
-            sparse.to(target), count, batch_size=batch_size, generator=generator, progress=progress, **options
-        )
+            context = replace(context, workers=stack.enter_context(Processes(copy.deepcopy(network).cpu(), names)))
+        raw = upsampler.upsample_cloud(sparse.to(target), count, context)
         dense = with_unit_normals(raw.cpu().double(), sparse)
     return frame.from_unit(dense[None])[0].numpy()
 
@@ -154,6 +124,41 @@ def output_count(n: int, ratio: float) -> int:
     if count > LARGEST:
         raise ValueError(f"ratio={ratio:g}: asks for {count} points, at most {LARGEST:g} are made; lower it")
     return count
+
+
+def normals(points: np.ndarray, neighbors: int = 16, *, progress: Progress = silent) -> np.ndarray:
+    """Normals of a cloud: estimated, and oriented outward on closed shapes, to one side on open ones.
+
+    Those of `upsample` where it gets none. They depend neither on the order of the points nor on repeated ones.
+
+    Args:
+        points: (n, 3), n >= 16, in any unit and anywhere; an array, or a tensor on any device.
+        neighbors: of the plane fits that begin it, at least 3.
+        progress: called as progress(stage, done, total).
+
+    Returns:
+        (n, 3) float64, of unit length; NaN for points that are not finite.
+
+    Raises:
+        ValueError: in one line, which argument is wrong and what was expected.
+    """
+    array = _array(points, "points: expected an array (n, 3)")
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"points: expected an array (n, 3), found shape {array.shape}")
+    different = check_cloud(Cloud(array, None, {}), "points", minimum=MINIMUM).points
+    different = different[np.lexsort(different.T)]
+    unit, _ = _unit_sphere(different)
+    if not (isinstance(neighbors, Integral) and 3 <= neighbors <= len(different)):
+        raise ValueError(
+            f"neighbors={neighbors}: expected a whole number from 3 to {len(different)}, the different points"
+        )
+    progress("normals", 0, 1)
+    estimated = estimate_normals(unit, int(neighbors))[0].numpy()
+    progress("normals", 1, 1)
+    finite = np.isfinite(array).all(1)
+    found = np.full(array.shape, np.nan)
+    found[finite] = estimated[cKDTree(different).query(array[finite])[1]]  # each point is one of them
+    return found
 
 
 def source(model: str | PathLike[str], normals: np.ndarray | None) -> str | PathLike[str]:
@@ -194,11 +199,17 @@ def _short(value: object) -> str:
     return f"{value:g}" if isinstance(value, Real) else repr(value)[:40]
 
 
+def modules_of(model: object) -> list[nn.Module]:
+    """All modules of a network; of an upsampler without one, none."""
+    return list(model.modules()) if isinstance(model, nn.Module) else []
+
+
 @contextmanager
-def evaluating(network: nn.Module) -> Iterator[None]:
+def evaluating(model: object) -> Iterator[None]:
     """A network in eval mode, each of its modules in its own mode again in the end."""
-    training = [module for module in network.modules() if module.training]
-    network.eval()
+    training = [module for module in modules_of(model) if module.training]
+    for module in training:
+        module.training = False
     try:
         yield
     finally:
@@ -206,10 +217,16 @@ def evaluating(network: nn.Module) -> Iterator[None]:
             module.training = True
 
 
-def _on_device(model: nn.Module | str | PathLike[str], device: str) -> tuple[nn.Module, torch.device]:
+def _model(model: Any, normals: np.ndarray | None) -> tuple[Any, bool]:
+    """The network or upsampler that is meant, and whether it is the caller's own."""
+    if not isinstance(model, str | PathLike):
+        return model, True
+    return (classical(str(model)) if model in CLASSICAL else checkpoint.load(source(model, normals))), False
+
+
+def _on_device(model: Any, given: bool, device: str) -> tuple[Any, torch.device]:
     """The network on a device, and which; one that is given and lies elsewhere is copied, not moved."""
-    given = isinstance(model, nn.Module)
-    network = model if isinstance(model, nn.Module) else checkpoint.load(model)
+    tensors = [tensor for module in modules_of(model) for tensor in (*module.parameters(False), *module.buffers(False))]
     if device != "auto":
         try:
             torch.empty(0, device=device)
@@ -217,12 +234,12 @@ def _on_device(model: nn.Module | str | PathLike[str], device: str) -> tuple[nn.
             raise ValueError(f"device={device}: is not here; expected auto, cpu, or cuda where there is one") from None
         target = torch.device(device)
     elif given:
-        target = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
+        target = tensors[0].device if tensors else torch.device("cpu")
     else:
         target = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    if given and any(tensor.device != target for tensor in (*network.parameters(), *network.buffers())):
-        network = copy.deepcopy(network)
-    return network.to(target), target
+    if all(tensor.device == target for tensor in tensors):
+        return model, target
+    return (copy.deepcopy(model) if given else model).to(target), target
 
 
 def _names(target: torch.device, devices: int) -> list[str]:
@@ -235,25 +252,14 @@ def _names(target: torch.device, devices: int) -> list[str]:
     return [f"cuda:{number}" for number in range(devices)]
 
 
-def _upsampler(network: nn.Module, patch_size: int | None) -> "CloudUpsampler":
-    return network if isinstance(network, CloudUpsampler) else Patchwise(network, patch_size)
-
-
-def _begin(network: nn.Module, patch_size: int | None, batch_size: int | None, device: str) -> Begin:
-    """What a process of its own does with clouds."""
-    upsampler = _upsampler(network.to(device), patch_size)
-    work = upsampler.projections if isinstance(upsampler, Surface) else cast(Patchwise, upsampler).predictions
-    return partial(work, batch_size=batch_size)
-
-
-def _digest(network: nn.Module, sparse: Tensor, count: int, upsampler: object) -> str:
+def _digest(network: Any, sparse: Tensor, count: int, upsampler: object) -> str:
     """Of all that the parts of a computation depend on."""
     digest = hashlib.sha256(sparse.numpy().tobytes())
-    for name, value in network.state_dict().items():
+    for name, value in network.state_dict().items() if modules_of(network) else ():
         digest.update(name.encode() + value.cpu().numpy().tobytes())
     plain = [
         (name, value)
-        for module in (upsampler, *network.modules())
+        for module in (upsampler, *modules_of(network))
         for name, value in sorted(vars(module).items())
         if name != "training" and isinstance(value, int | float | str)
     ]
@@ -262,15 +268,10 @@ def _digest(network: nn.Module, sparse: Tensor, count: int, upsampler: object) -
 
 
 def _prepare(cloud: Cloud, progress: Progress) -> tuple[Tensor, Frame]:
-    """Different points in a fixed order with normals, (n, 6) float64 in the unit sphere, and the way back."""
-    points, normals = cloud.points, cloud.normals
-    order = np.lexsort(points.T)
-    frame = unit_sphere_frame(torch.from_numpy(points[order])[None])
-    unit = frame.to_unit(torch.from_numpy(points[order])[None])
-    extent = torch.linalg.svdvals(unit[0] - unit[0].mean(0))
-    if extent[1] < 1e-9 * extent[0]:
-        raise ValueError(f"points: all {len(points)} points lie on a line; expected points on a surface")
-    given = None if normals is None else torch.from_numpy(normals[order])
+    """The points in a fixed order with normals, (n, 6) float64 in the unit sphere, and the way back."""
+    order = np.lexsort(cloud.points.T)
+    unit, frame = _unit_sphere(cloud.points[order])
+    given = None if cloud.normals is None else torch.from_numpy(cloud.normals[order])
     if given is None or given.isnan().any():
         progress("normals", 0, 1)
         directions = complete_normals(unit[0], given)
@@ -280,137 +281,12 @@ def _prepare(cloud: Cloud, progress: Progress) -> tuple[Tensor, Frame]:
     return torch.cat([unit[0], directions], 1), frame
 
 
-class Patchwise:
-    """The paper's procedure for a network of patches, in passes of `network.ratio` times as many points each.
-
-    patch_size: points of a patch; None: what the network says, or 1024. The cloud stays on the CPU, in float64;
-    patches go to the network in its own type and device.
-    """
-
-    def __init__(self, network: nn.Module, patch_size: int | None = None) -> None:
-        self.network = network
-        ratio = getattr(network, "ratio", None)
-        if not (isinstance(ratio, Integral) and int(ratio) >= 1):
-            raise ValueError(
-                "model: expected a network with an attribute `ratio`, the points out for each point in, a whole number "
-                f">= 1; found {_short(ratio)}"
-            )
-        self.ratio = int(ratio)
-        self.patch_size = patch_size or int(getattr(network, "patch_size", 1024))
-        self.like = next(network.parameters(), torch.empty(0))  # tells device and type
-
-    def upsample_cloud(
-        self,
-        cloud: Tensor,
-        count: int,
-        *,
-        batch_size: int | None,
-        generator: torch.Generator,
-        progress: Progress,
-        keep: Keep = forget,
-        workers: Workers | None = None,
-    ) -> Tensor:
-        """cloud (n, 6) in the unit sphere -> (count, 3 or 6) on the CPU; nothing is random."""
-        cloud = cloud.cpu()
-        workers = workers or Here(partial(self.predictions, batch_size=batch_size))
-        together = self.batch(batch_size) * (BATCHES if self.like.device.type == "cpu" else 1)
-        *before, last = self.pass_sizes(len(cloud), count)
-        for size in before:
-            cloud = with_unit_normals(self._one_pass(cloud, size, together, workers, progress, keep), cloud)
-        return self._one_pass(cloud, last, together, workers, progress, keep)
-
-    def pass_sizes(self, n: int, count: int) -> list[int]:
-        """Number of points after each pass from n to count: as few passes as possible, all with the same growth."""
-        if self.ratio == 1 and count > n:
-            raise ValueError(
-                f"model: a network of ratio 1 makes no more points than it gets, {count} of {n} were asked for; leave "
-                "ratio=1, or take a network of ratio 2 or more"
-            )
-        reach = self.ratio * (SLACK if n > self.patch_size else 1)
-        passes = 1
-        while count > n * reach**passes:
-            passes += 1
-        sizes = [n]
-        for i in range(1, passes):
-            sizes.append(min(math.ceil(n * (count / n) ** (i / passes)), self.ratio * sizes[-1]))
-        return [*sizes[1:], count]
-
-    def _one_pass(
-        self, cloud: Tensor, count: int, together: int, workers: Workers, progress: Progress, keep: Keep
-    ) -> Tensor:
-        """The network on patches of the cloud (n, 6), and farthest points of all it predicts: (count, 3 or 6)."""
-        n, size = len(cloud), min(self.patch_size, len(cloud))
-        centers = 1 if size == n else max(1, round(self.ratio * n / size))
-        stage = f"network, {n} points"
-        progress(stage, 0, centers)
-        idx = patches.extract(cloud, centers, size, cover=True)
-        if size < SMALLEST_PATCH:
-            idx = idx[:, torch.arange(SMALLEST_PATCH) % size]
-
-        def predict(first: int) -> Tensor:
-            found = []
-            for number, part in enumerate(workers.map(cloud, idx[first : first + KEPT].split(together)), 1):
-                found.append(part)
-                progress(stage, min(first + number * together, len(idx)), len(idx))
-            return torch.cat(found)
-
-        predicted = torch.empty(0)
-        for first in range(0, len(idx), KEPT):
-            found = keep(f"{stage}, patch {first}", partial(predict, first))
-            each = len(found) // min(KEPT, len(idx) - first)  # points of a patch
-            if not first:
-                predicted = found.new_empty(len(idx) * each, found.shape[1])
-            predicted[first * each : first * each + len(found)] = found
-        progress(stage, len(idx), len(idx))
-        stage = f"farthest points, {count} of {len(predicted)}"
-        return patches.merge(_finite(predicted)[None], count, partial(progress, stage))
-
-    def predictions(self, cloud: Tensor, batch_size: int | None = None) -> Work:
-        """Of a cloud (n, 6): patches idx (p, size) -> their predictions, one after the other, in the cloud's frame.
-
-        On the CPU each thread works on patches of its own. That is faster than many threads in one operation, and the
-        last digit of a matrix product, which may decide between two farthest points, depends on nothing else.
-        """
-        on_cpu, size = self.like.device.type == "cpu", self.batch(batch_size)
-
-        def predict(idx: Tensor) -> Tensor:
-            patch = cloud[idx]
-            frame = unit_sphere_frame(patch)  # in float64, so that float32 has only the patch to resolve
-            dense = frame.from_unit(self.network(frame.to_unit(patch).to(self.like)).cpu().double())
-            return dense.flatten(0, 1)
-
-        def work(idx: Tensor) -> Tensor:
-            batches = idx.split(size)
-            return torch.cat(threads.spread(predict, batches) if on_cpu else [predict(batch) for batch in batches])
-
-        return work
-
-    def batch(self, batch_size: int | None) -> int:
-        """Patches at once."""
-        return 1 if self.like.device.type == "cpu" else batch_size or 64
-
-
-def with_unit_normals(dense: Tensor, sparse: Tensor) -> Tensor:
-    """Predictions (m, 3) or (m, 6) with unit normals, (m, 6); `sparse` (n, 6) is the cloud they were made from.
-
-    A predicted normal without direction becomes that of the nearest input point. Where none are predicted they are
-    estimated from the predicted points, with the side of the nearest input normal.
-    """
-    points = _finite(dense)[:, :3]
-    if dense.shape[1] == 3:
-        normals = estimate_normals(points[None], orient=False)
-        normals = flip_to_reference(normals, points[None], sparse[None, :, :3], sparse[None, :, 3:])[0]
-    else:
-        normals = dense[:, 3:6]
-    length = normals.norm(dim=1, keepdim=True)
-    lost = (~(length > ZERO) | length.isinf()).squeeze(1)  # NaN counts as lost
-    normals = normals / length
-    if bool(lost.any()):
-        normals[lost] = sparse[nearest(points[None, lost], sparse[None, :, :3]).idx[0], 3:]
-    return torch.cat([points, normals], 1)
-
-
-def _finite(prediction: Tensor) -> Tensor:
-    if not bool(torch.isfinite(prediction[:, :3]).all()):
-        raise ValueError("model: predicted points that are NaN or infinite; its weights are damaged, train it again")
-    return prediction
+def _unit_sphere(points: np.ndarray) -> tuple[Tensor, Frame]:
+    """Points (n, 3) as (1, n, 3) in the unit sphere, and the way back."""
+    cloud = torch.from_numpy(points)[None]
+    frame = unit_sphere_frame(cloud)
+    unit = frame.to_unit(cloud)
+    extent = torch.linalg.svdvals(unit[0] - unit[0].mean(0))
+    if extent[1] < 1e-9 * extent[0]:
+        raise ValueError(f"points: all {len(points)} points lie on a line; expected points on a surface")
+    return unit, frame

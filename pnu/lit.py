@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from pnu.checkpoint import write
 from pnu.metrics import METRICS, CloudMetrics, Metric
 from pnu.models.norm import synchronize
+from pnu.upsamplers import dense_patches
 
 Batch = Mapping[str, Any]
 
@@ -130,7 +131,7 @@ class UpsamplingModule(pl.LightningModule):
         self.started_at, self.elapsed_s = time.monotonic(), 0.0  # elapsed_s is the same in all processes
 
     def forward(self, patch: Tensor) -> Tensor:
-        return self.model(patch)
+        return dense_patches(self.model, patch)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         assert self.loss is not None

@@ -14,13 +14,14 @@ import pytest
 import torch
 import yaml
 
-from pnu import classical, evaluation, metrics
+from pnu import evaluation, metrics
 from pnu.data import shapes
 from pnu.evaluate import main
 from pnu.evaluation import cases, cost, report
 from pnu.io import Mesh, read_cloud, read_json, write_cloud, write_json, write_mesh
 from pnu.models.pnu import PNU
 from pnu.ops.surface import closest_points, sample_area, sample_poisson_disk
+from pnu.upsamplers import classical
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +171,7 @@ def test_inputs_without_normals() -> None:
     meshes = {"pear": lambda: shapes.make("pear")}
     drawn = list(evaluation.mesh_cases(meshes, ["uniform"], points=500, truth_points=2000, normals=False))
     assert drawn[0].normals is None
-    upsampler = evaluation.network_upsampler(classical.method("midpoint"), 2)
+    upsampler = evaluation.network_upsampler(classical("midpoint"), 2)
     made, _, given = evaluation.evaluate({"midpoint": upsampler}, drawn, ratio=2)
     assert 0 < given["normal_unsigned_deg"] < 20  # estimated
     assert made["normal_unsigned_deg"] < 20

@@ -11,8 +11,9 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from pnu.inference import Patchwise, upsample
+from pnu.inference import normals, upsample
 from pnu.models.pnu import PNU
+from pnu.upsamplers import Context, Patches
 
 Array = np.ndarray
 
@@ -70,7 +71,7 @@ def test_exact_count_and_unit_normals(n: int, ratio: float) -> None:
 @pytest.mark.parametrize("ratio", [2, 4, 16])
 @pytest.mark.parametrize("network_ratio", [2, 4])
 def test_passes_reach_any_ratio(ratio: int, network_ratio: int) -> None:
-    sizes = Patchwise(Spread(network_ratio)).pass_sizes(1000, ratio * 1000)
+    sizes = Patches(Spread(network_ratio)).pass_sizes(1000, ratio * 1000)
     assert sizes[-1] == ratio * 1000
     assert network_ratio ** len(sizes) == max(ratio, network_ratio)
     growth = np.array(sizes) / [1000, *sizes[:-1]]
@@ -81,7 +82,7 @@ def test_pass_sizes_never_outgrow_the_network() -> None:
     rng = np.random.default_rng(0)
     for _ in range(2000):
         n, ratio = int(rng.integers(16, 300)), rng.uniform(1, 40)
-        sizes = [n, *Patchwise(Spread(patch_size=300)).pass_sizes(n, round(ratio * n))]
+        sizes = [n, *Patches(Spread(patch_size=300)).pass_sizes(n, round(ratio * n))]
         assert all(b <= 4 * a for a, b in pairwise(sizes)), sizes
 
 
@@ -209,6 +210,37 @@ def test_missing_normals_are_estimated_and_point_outward() -> None:
     assert cosine.min() > 0.8
 
 
+def test_normals() -> None:
+    """Outward, of unit length, for each point its own, whatever the order, the place and repeated points."""
+    points = sphere(1000) * [1, 0.8, 0.6]
+    found = normals(points)
+    outward = points / np.array([1, 0.8, 0.6]) ** 2
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    assert (found * outward).sum(1).min() > 0.95
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1)
+    order = np.random.default_rng(0).integers(0, 1000, 1500)  # some twice, some left out
+    order = np.concatenate([order, np.arange(1000)])
+    np.testing.assert_array_equal(normals(points[order]), found[order])
+    np.testing.assert_array_equal(normals(torch.from_numpy(points).requires_grad_()), found)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(upsample(points, model=Spread()), upsample(points, found, model=Spread()))
+
+
+@pytest.mark.parametrize(
+    ("points", "neighbors", "message"),
+    [
+        (sphere(20), 2, "^neighbors=2: expected a whole number from 3 to 20, the different points$"),
+        (sphere(20), 21, "^neighbors=21: expected a whole number from 3 to 20"),
+        (sphere(20), 4.5, "^neighbors=4.5: expected a whole number from 3 to 20"),
+        (sphere(15), 16, "^points: holds 15 points; at least 16 are needed$"),
+        (np.hstack([sphere(20), sphere(20)]), 16, r"^points: expected an array \(n, 3\), found shape \(20, 6\)$"),
+        (np.arange(60.0).reshape(20, 3), 16, "^points: all 20 points lie on a line"),
+    ],
+)
+def test_points_without_normals(points: Array, neighbors: int, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        normals(points, neighbors)
+
+
 def test_progress_reaches_the_end_of_each_stage() -> None:
     calls: dict[str, list[tuple[int, int]]] = {}
     upsample(
@@ -255,19 +287,17 @@ def test_tensors_as_points(dtype: torch.dtype) -> None:
     assert points.grad is None
 
 
-class Whole(nn.Module):
-    """A model with a procedure of its own for whole clouds."""
+class Whole:
+    """An upsampler of one's own."""
 
-    def upsample_cloud(
-        self, cloud: Tensor, count: int, *, batch_size: int | None, generator: torch.Generator, progress: object
-    ) -> Tensor:
+    def upsample_cloud(self, cloud: Tensor, count: int, context: Context) -> Tensor:
         assert cloud.dtype == torch.float64
         assert cloud[:, :3].norm(dim=1).max() == pytest.approx(1)
-        chosen = torch.randint(len(cloud), (count,), generator=generator)
+        chosen = torch.randint(len(cloud), (count,), generator=context.generator)
         return cloud[chosen] * torch.tensor([1, 1, 1, 2, 2, 2])
 
 
-def test_model_with_a_procedure_of_its_own() -> None:
+def test_an_upsampler_of_ones_own() -> None:
     points = sphere(100)
     dense = upsample(5 * points + 3, points, model=Whole(), ratio=2.5, seed=1)
     assert dense.shape == (250, 6)
@@ -358,9 +388,9 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024)
 def test_surface_model_where_there_is_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     cloud = sphere(300)
-    for normals in (cloud, None):
-        dense = upsample(cloud, normals, ratio=7.3)
+    for given in (cloud, None):
+        dense = upsample(cloud, given, ratio=7.3)
         assert dense.shape == (2190, 6)
         assert abs(np.linalg.norm(dense[:, :3], axis=1) - 1).max() < 0.1
         assert (dense[:, :3] * dense[:, 3:]).sum(1).min() > 0.8
-        np.testing.assert_array_equal(dense, upsample(cloud, normals, ratio=7.3, model="surface"))
+        np.testing.assert_array_equal(dense, upsample(cloud, given, ratio=7.3, model="surface"))

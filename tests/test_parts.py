@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from pnu import inference
 from pnu.checkpoint import load
 from pnu.inference import upsample
-from pnu.models import surface
 from pnu.models.pnu import PNU
+from pnu.models.surface import Surface
 from pnu.runtime.parts import Parts
+from pnu.upsamplers import patches as procedure
+from pnu.upsamplers import surface
 
 
 class Stop(Exception):
@@ -33,7 +34,7 @@ def patches(size: int = 128) -> PNU:
 @pytest.mark.parametrize("model", ["surface", "patches"])
 def test_an_interrupted_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, model: str) -> None:
     monkeypatch.setattr(surface, "KEPT", 1000)
-    monkeypatch.setattr(inference, "KEPT", 3)
+    monkeypatch.setattr(procedure, "KEPT", 3)
     points = sphere(800)
     network = "surface" if model == "surface" else patches()
     stage = "refinement" if model == "surface" else "farthest"
@@ -76,7 +77,7 @@ def test_parts_of_another_task_are_not_taken(tmp_path: Path) -> None:
 def test_parts_of_a_network_with_other_options_are_not_taken(tmp_path: Path) -> None:
     points = sphere(300)
     for sphere_first in (True, False):
-        network = surface.Surface(sphere=sphere_first)
+        network = Surface(sphere=sphere_first)
         network.load_state_dict(load("surface").state_dict())
         found = upsample(points, points, model=network, parts=tmp_path)
         np.testing.assert_array_equal(found, upsample(points, points, model=network))
@@ -99,5 +100,5 @@ def test_a_failed_part_leaves_no_file(tmp_path: Path) -> None:
         raise Stop
 
     with pytest.raises(Stop):
-        Parts(tmp_path / "a")("x", fail)
-    assert not list((tmp_path / "a").iterdir())
+        Parts(tmp_path).get("x", fail)
+    assert not list(tmp_path.iterdir())

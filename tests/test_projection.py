@@ -7,11 +7,18 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pnu.models.surface import Projector, Surface, spared
+from pnu.models.surface import Projector, Surface
 from pnu.ops.frames import feet, local_frames, tangent_basis
 from pnu.ops.spacing import spacing
 from pnu.ops.spread import repel, tangent_discs
 from pnu.ops.transforms import rotation_matrix
+from pnu.upsamplers import Context, SurfaceProjection
+from pnu.upsamplers import surface as procedure
+from pnu.upsamplers.surface import reject_worst
+
+
+def upsample(network: Surface, cloud: Tensor, count: int, **options: Any) -> Tensor:
+    return SurfaceProjection(network).upsample_cloud(cloud, count, Context(**options))
 
 
 def sphere(n: int, seed: int = 0) -> Tensor:
@@ -141,8 +148,8 @@ def test_projection_turns_and_grows_with_the_cloud(turn: Tensor) -> None:
 
 def test_clouds_turn_and_grow(turn: Tensor) -> None:
     model, cloud = trained(), wavy(400)
-    ours = model.upsample_cloud(cloud, 1200)
-    theirs = model.upsample_cloud(moved(cloud, turn, 2.0, torch.ones(3, dtype=torch.float64)), 1200)
+    ours = upsample(model, cloud, 1200)
+    theirs = upsample(model, moved(cloud, turn, 2.0, torch.ones(3, dtype=torch.float64)), 1200)
     expected = moved(ours, turn, 2.0, torch.ones(3, dtype=torch.float64))
     apart = torch.cdist(expected[:, :3], theirs[:, :3]).min(1).values
     # a near-tie of the farthest points may go either way
@@ -151,21 +158,21 @@ def test_clouds_turn_and_grow(turn: Tensor) -> None:
 
 @pytest.mark.parametrize("count", [400, 401, 777, 1600, 3000])
 def test_count_is_exact(count: int) -> None:
-    dense = trained().upsample_cloud(wavy(400), count)
+    dense = upsample(trained(), wavy(400), count)
     assert dense.shape == (count, 6)
     torch.testing.assert_close(dense[:, 3:].norm(dim=1), torch.ones(count, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("n", [16, 17, 40])
 def test_small_clouds(n: int) -> None:
-    dense = trained(neighbours=32, reach=48).upsample_cloud(sphere(n), 4 * n)
+    dense = upsample(trained(neighbours=32, reach=48), sphere(n), 4 * n)
     assert dense.shape == (4 * n, 6)
     assert torch.isfinite(dense).all()
 
 
 def test_batch_size_does_not_matter() -> None:
     model, cloud = trained(), wavy(300)
-    whole, parts = (model.upsample_cloud(cloud, 900, batch_size=size) for size in (10_000, 37))
+    whole, parts = (upsample(model, cloud, 900, batch_size=size) for size in (10_000, 37))
     torch.testing.assert_close(parts, whole, atol=1e-9, rtol=0)
 
 
@@ -189,7 +196,7 @@ def test_feet_are_those_of_the_frames() -> None:
 
 
 def test_untrained_model_stays_on_a_sphere() -> None:
-    dense = Surface().upsample_cloud(sphere(600), 2400)
+    dense = upsample(Surface(), sphere(600), 2400)
     assert (dense[:, :3].norm(dim=1) - 1).abs().max() < 1e-3
     assert (dense[:, :3] * dense[:, 3:]).sum(1).min() > 0.98
 
@@ -230,18 +237,18 @@ def test_parts_can_be_left_out() -> None:
     assert outputs["projected"].shape[0] == 1
 
 
-def test_most_doubtful_points_are_dropped() -> None:
+def test_most_doubtful_points_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     model, cloud = trained(), wavy(300)
     every = {}
     model.reject = 0.01
-    project = model.in_parts
+    project = procedure.in_parts
 
-    def spy(query: Tensor, cloud: Tensor, **options: Any) -> tuple[Tensor, Tensor]:
-        every["last"] = project(query, cloud, **options)
+    def spy(*clouds: Any, **options: Any) -> tuple[Tensor, Tensor]:
+        every["last"] = project(*clouds, **options)
         return every["last"]
 
-    model.in_parts = spy  # type: ignore[method-assign]
-    dense = model.upsample_cloud(cloud, 600)
+    monkeypatch.setattr(procedure, "in_parts", spy)
+    dense = upsample(model, cloud, 600)
     points, error = every["last"]
     assert len(points) == 606
     kept = torch.isin(points[:, 0], dense[:, 0])
@@ -257,13 +264,13 @@ def test_of_doubtful_neighbours_the_worst_is_dropped() -> None:
     grid = torch.stack([x, y, torch.zeros_like(x)], -1).flatten(0, 1)
     error = torch.zeros(400)
     error[105:110], error[300] = torch.tensor([7.0, 8.0, 9.0, 8.5, 7.5]), 5.0
-    stays = spared(grid, error, 398)
+    stays = reject_worst(grid, error, 398)
     assert sorted(set(range(400)) - set(stays.tolist())) == [107, 300]
 
 
 @pytest.mark.parametrize("count", [0, 1, 5, 19, 20])
 def test_count_is_exact_however_many_are_dropped(count: int) -> None:
-    stays = spared(sphere(20)[:, :3], torch.arange(20.0).flip(0), count)
+    stays = reject_worst(sphere(20)[:, :3], torch.arange(20.0).flip(0), count)
     assert len(stays) == count
     assert stays.equal(stays.unique())
 
@@ -276,7 +283,7 @@ def test_noisy_points_are_smoothed_first() -> None:
         shift = torch.randn(800, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
         cloud[:, :3] += noise * shift
         seen: set[str] = set()
-        dense = model.upsample_cloud(cloud, 1600, progress=lambda stage, done, total, seen=seen: seen.add(stage))
+        dense = upsample(model, cloud, 1600, progress=lambda stage, done, total, seen=seen: seen.add(stage))
         assert ("smoothing, the points are noisy" in seen) == (noise > 0)
         stages |= seen
         assert float((dense[:, :3].norm(dim=1) - 1).abs().mean()) < max(0.5 * noise, 0.002)
@@ -309,15 +316,14 @@ def test_training_seeds_are_spread_and_pushed_outward() -> None:
 
 
 def test_every_stage_of_a_large_run_moves(monkeypatch: pytest.MonkeyPatch) -> None:
-    from pnu.models import surface
     from pnu.ops import sampling, spread
 
-    monkeypatch.setattr(surface, "BATCHES", 1)
+    monkeypatch.setattr(procedure, "BATCHES", 1)
     monkeypatch.setattr(sampling, "LARGE", 2000)
     monkeypatch.setattr(sampling, "LARGE_BLOCK", 1000)
     monkeypatch.setattr(spread, "ROWS", 1000)
     steps: dict[str, list[tuple[int, int]]] = {}
-    Surface().upsample_cloud(sphere(600), 2400, progress=lambda stage, *step: steps.setdefault(stage, []).append(step))
+    upsample(Surface(), sphere(600), 2400, progress=lambda stage, *step: steps.setdefault(stage, []).append(step))
     stages = ["seeds", "spheres", "shortlist", "projection", "thinning", "even spacing", "refinement 1", "refinement 2"]
     assert list(steps) == stages
     for stage, told in steps.items():

@@ -55,10 +55,12 @@ points.flags.writeable = False  # a caller's array may be read-only
 
 FUNCTIONS = {
     "load": ["pnu.load('surface')", "pnu.load('pnu')"],
+    "normals": ["pnu.normals(points)"],
     "upsample": [
         "pnu.upsample(points)",
         "pnu.upsample(points, points, model='pnu', ratio=2)",
         "pnu.upsample(points, points, model=Spread(), devices=2)",
+        "pnu.upsample(points, points, model='apss', seed=4)",
     ],
 }
 

@@ -157,7 +157,7 @@ def test_the_default_is_what_comes_with_pnu(
     from pnu.upsample import main
 
     monkeypatch.chdir(place)
-    points, normals, _ = read_cloud(place / "cloud.ply")
+    points, normals, *_ = read_cloud(place / "cloud.ply")
     np.save(place / "points.npy", points)
     main(["input=cloud.ply", "output=a.npy", *run])
     main(["input=points.npy", "output=b.npy", *run])
@@ -209,7 +209,7 @@ def test_killed_and_gone_on(tmp_path: Path) -> None:
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     write_cloud(tmp_path / "cloud.ply", points, points)
     code = (
-        "import pnu.upsample as module; from pnu.models import surface\n"
+        "import pnu.upsample as module; from pnu.upsamplers import surface\n"
         "if __name__ == '__main__': module.LONG, surface.KEPT = 1, 2**12; module.main()"
     )
     (tmp_path / "run.py").write_text(code)

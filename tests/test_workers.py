@@ -12,23 +12,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from pnu import inference
 from pnu.inference import upsample
-from pnu.models import surface
-from pnu.runtime.workers import Here, Processes
+from pnu.runtime.workers import InProcess, Processes
+from pnu.upsamplers import APSS, surface
+from pnu.upsamplers import patches as procedure
 from tests.test_parts import patches, sphere
 
 CLOUD = torch.arange(12.0, dtype=torch.float64).view(4, 3)
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 
-def make(device: str) -> Callable[[Tensor], Callable[[Tensor], Tensor]]:
-    return begin
-
-
-def begin(cloud: Tensor) -> Callable[[Tensor], Tensor]:
+def begin(network: nn.Module, cloud: Tensor) -> Callable[[Tensor], Tensor]:
     return partial(work, cloud)
 
 
@@ -45,10 +41,10 @@ def work(cloud: Tensor, part: Tensor) -> Tensor:
 
 def test_order_errors_and_end() -> None:
     parts = list(torch.arange(4).split(1))
-    with Processes(make, ["cpu", "cpu"]) as workers:
+    with Processes(nn.Identity(), ["cpu", "cpu"]) as workers:
         for cloud in (CLOUD, -CLOUD, CLOUD):
-            found = list(workers.map(cloud, parts))
-            expected = list(Here(begin).map(cloud, parts))
+            found = list(workers.map(begin, cloud, parts))
+            expected = list(InProcess(nn.Identity()).map(begin, cloud, parts))
             assert [f[:1].tolist() for f in found] == [e[:1].tolist() for e in expected]
         pids = {int(f[1, 0]) for f in found}
         assert os.getpid() not in pids
@@ -58,7 +54,7 @@ def test_order_errors_and_end() -> None:
             (-3, "^devices=2: a process ended amid its work; "),
         ):
             with pytest.raises(ValueError, match=message) as error:
-                list(workers.map(CLOUD, [*parts, torch.tensor([number]), *parts]))
+                list(workers.map(begin, CLOUD, [*parts, torch.tensor([number]), *parts]))
             assert "\n" not in str(error.value)
     assert not any(alive(pid) for pid in pids)
 
@@ -67,7 +63,7 @@ def test_order_errors_and_end() -> None:
 @pytest.mark.parametrize("model", ["surface", pytest.param("patches", marks=pytest.mark.slow)])
 def test_the_number_of_devices_does_not_matter(model: str, devices: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(surface, "BATCHES", 1)  # many parts
-    monkeypatch.setattr(inference, "BATCHES", 2)
+    monkeypatch.setattr(procedure, "BATCHES", 2)
     points, network = sphere(1000), "surface" if model == "surface" else patches(64)
     one, several = (
         upsample(points, points, ratio=2, model=network, device="cpu", devices=number) for number in (1, devices)
@@ -76,11 +72,9 @@ def test_the_number_of_devices_does_not_matter(model: str, devices: int, monkeyp
 
 
 def test_what_cannot_be_shared() -> None:
-    from pnu import classical
-
     points = sphere(30)
     with pytest.raises(ValueError, match=r"^devices=2: APSS works in one process; leave devices=1$"):
-        upsample(points, points, model=classical.method("apss"), devices=2)
+        upsample(points, points, model=APSS(), devices=2)
     with pytest.raises(ValueError, match=r"^devices=0: expected a whole number >= 1$"):
         upsample(points, points, model="surface", devices=0)
 

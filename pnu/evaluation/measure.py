@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from pnu import inference
+from pnu import inference, upsamplers
 from pnu.evaluation.cases import Case, Truth, generator
 from pnu.evaluation.cost import Cost
 from pnu.metrics import METRICS, Metric, Pair, measured
@@ -19,12 +19,12 @@ Row = dict[str, Any]
 """shape, kind, frame, truth_points, method, points_in, points_out, and the metrics; lengths in the frame of the truth,
 not x 1e3."""
 
-Upsampler = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
+Method = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
 """points (n, 3), normals (n, 3) or None -> cloud (m, 6)."""
 
 
 def evaluate(
-    methods: Mapping[str, Upsampler],
+    methods: Mapping[str, Method],
     cases: Iterable[Case],
     *,
     ratio: float,
@@ -82,8 +82,8 @@ def normals_of(case: Case) -> np.ndarray:
 
 
 def network_upsampler(
-    model: nn.Module, ratio: float, *, passes: bool = False, name: str = "run", **options: Any
-) -> Upsampler:
+    model: nn.Module | upsamplers.Upsampler, ratio: float, *, passes: bool = False, name: str = "run", **options: Any
+) -> Method:
     """A network, or a classical method, as an upsampler: through `pnu.upsample`, as users call it.
 
     Raises:
@@ -91,7 +91,7 @@ def network_upsampler(
             passes or by leaving points out.
     """
     trained = getattr(model, "ratio", None)
-    if not isinstance(model, inference.CloudUpsampler) and trained != ratio and not passes:
+    if isinstance(upsamplers.upsampler_of(model), upsamplers.Patches) and trained != ratio and not passes:
         raise ValueError(
             f"ratio={ratio:g}: {name} was trained for {trained}; give ratio={trained}, or passes=true to "
             f"reach {ratio:g} by passes and farthest points"

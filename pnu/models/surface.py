@@ -1,39 +1,22 @@
-"""Learned surface projection: seeds around the input points are moved onto the surface that the points sample.
+"""Learned surface projection: points near a cloud are moved onto the surface that it samples.
 
-A seed sees its nearest input points with their normals in a local frame (`pnu.ops.frames`). An algebraic sphere gives
+A query sees its nearest input points with their normals in a local frame (`pnu.ops.frames`). An algebraic sphere gives
 a first foot and normal; a small network shared by all neighbours, with maximum and attention pooling, corrects both.
-There are no patches, hence no borders; the cost grows with the output; any ratio is possible.
+How clouds become dense with it, is in `pnu.upsamplers.surface`.
 """
-
-from collections.abc import Callable
-from functools import partial
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear, normalize
 
-from pnu.ops.blocks import along_curve
-from pnu.ops.frames import FEATURES, feet, local_frames
+from pnu.ops.frames import FEATURES, local_frames
 from pnu.ops.grouping import gather
-from pnu.ops.nearest import Search, knn
-from pnu.ops.noise import noise_level
-from pnu.ops.sampling import farthest_points, farthest_points_large
-from pnu.ops.spacing import spacing
-from pnu.ops.spread import repel, tangent_discs
-from pnu.runtime import threads
-from pnu.runtime.parts import Keep, forget
-from pnu.runtime.progress import Progress, Step, silent
-from pnu.runtime.workers import Here, Work, Workers
+from pnu.ops.nearest import knn
+from pnu.ops.sampling import farthest_points
+from pnu.ops.spread import tangent_discs
 
 EACH = 3  # seeds of a point, in training, before they are thinned out
 PUSH = 0.1  # between rounds of training, beside the way from its point to a seed
-SMOOTH = 0.1  # noise in spacings from which on a cloud is smoothed first
-KEPT = 2**19  # queries whose projections are kept in one file
-BATCH = 512  # queries at once on a CPU,
-BATCHES = 32  # of which its threads share so many
-AROUND = 8  # points of which one at most is dropped,
-DOUBTFUL = 16  # looked for among so many for each point to drop
-CLOSE = 12  # neighbours of the sphere that candidates are first moved to
 DENSE = 16  # neighbours that are all looked at; farther ones are thinned out
 
 
@@ -87,10 +70,12 @@ class Projector(nn.Module):
 
 
 class Surface(nn.Module):
-    """Upsampling by learned projection: seeds, spheres, projection of a shortlist, even spacing, projection, rejection.
+    """A network that projects points onto the surface of a cloud.
+
+    How its upsampler (`procedure`) works with it is kept here, as what was found best for these weights.
 
     Args:
-        ratio: points out for each point in, where none is asked for (`upsample_cloud` takes any count).
+        ratio: points out for each point in, where none is asked for.
         neighbours: input points that a seed looks at.
         reach: rank of the farthest of them; beyond the 16 nearest they are thinned out evenly.
         width: of the network.
@@ -108,6 +93,7 @@ class Surface(nn.Module):
     """
 
     predicts_normals = True
+    procedure = "surface"
     patch_size = 1024
 
     def __init__(
@@ -191,173 +177,5 @@ class Surface(nn.Module):
         return [rank for rank in [*range(min(DENSE, self.neighbours)), *far] if rank < n]
 
     def forward(self, patch: Tensor) -> Tensor:
-        """patch (B, n, 6) -> (B, ratio n, 6)."""
-        count = self.ratio * patch.shape[1]
-        return torch.stack([self.upsample_cloud(cloud, count) for cloud in patch])
-
-    @torch.no_grad()
-    def upsample_cloud(
-        self,
-        cloud: Tensor,
-        count: int,
-        *,
-        batch_size: int | None = None,
-        generator: torch.Generator | None = None,
-        progress: Progress = lambda stage, done, total: None,
-        keep: Keep = forget,
-        workers: Workers | None = None,
-    ) -> Tensor:
-        """cloud (n, 6) -> (count, 6) with unit normals. Nothing is random.
-
-        The points of a cloud that is noisy beside their spacing are themselves projected first. batch_size: queries at
-        once; keep: what takes finished parts; workers: who projects, with `projections`.
-        """
-        workers = workers or Here(partial(self.projections, batch_size=batch_size))
-        run = partial(self.in_parts, workers=workers, batch_size=batch_size, progress=progress, keep=keep)
-        if noise_in_spacings(cloud) > SMOOTH:
-            cloud, _ = run(cloud, cloud, stage="smoothing, the points are noisy")
-        each = max(1, round(self.seeds * count / len(cloud)))
-        query = keep(
-            "seeds", lambda: seeds_around(cloud, each, round(self.candidates * count), partial(progress, "seeds"))
-        ).to(cloud)
-        if self.projector.sphere:
-            here = Here(partial(self.spheres, batch_size=batch_size))
-            query, _ = run(query, cloud, workers=here, stage="spheres")
-        some, more = round(self.shortlist * count), round((1 + self.reject) * count)
-        query = keep("shortlist", lambda: thin(query, some, partial(progress, "shortlist"))).to(cloud)
-        query, error = run(query, cloud, stage="projection")
-        query = keep("thinned", lambda: thin(query, more, partial(progress, "thinning"))).to(cloud)
-        if self.relaxation:
-            query = keep("even", lambda: evened(query, self.relaxation, partial(progress, "even spacing"))).to(cloud)
-        for i in range(self.refinements):
-            query, error = run(query, cloud, stage=f"refinement {i + 1}")
-        return query[spared(query[:, :3], error, count)]
-
-    def in_parts(
-        self,
-        query: Tensor,
-        cloud: Tensor,
-        *,
-        workers: Workers,
-        batch_size: int | None,
-        progress: Progress,
-        keep: Keep,
-        stage: str,
-    ) -> tuple[Tensor, Tensor]:
-        """query (m, 6) -> projected (m, 6) and logarithm of the expected error (m,)."""
-        size = self.batch(cloud, batch_size) * (BATCHES if cloud.device.type == "cpu" else 1)
-        order = along_curve(query[:, :3])
-        query = query[order]
-
-        def kept(first: int) -> Tensor:
-            parts = query[first : first + KEPT].split(size)
-            found = []
-            for number, part in enumerate(workers.map(cloud, parts), 1):
-                found.append(part.to(cloud))
-                progress(stage, min(first + number * size, len(query)), len(query))
-            return torch.cat(found)
-
-        progress(stage, 0, len(query))
-        starts = range(0, len(query), KEPT)
-        everything = torch.empty(len(query), 7, dtype=query.dtype, device=query.device)
-        for first in starts:
-            everything[order[first : first + KEPT]] = keep(
-                f"{stage}, {first} of {len(query)}", partial(kept, first)
-            ).to(everything)
-        progress(stage, len(query), len(query))
-        return everything[:, :6], everything[:, 6]
-
-    def projections(self, cloud: Tensor, batch_size: int | None = None) -> Work:
-        """Around a cloud (n, 6): queries (m, 6) -> projected and logarithm of the expected error, (m, 7)."""
-        ranks = self.ranks(len(cloud))
-
-        def project(query: Tensor, cloud: Tensor, idx: Tensor) -> Tensor:
-            projected, log_error, spacing = self.project(query[None], cloud[None], idx[None, :, ranks])
-            return torch.cat([projected[0], (log_error[0] + spacing[0].log()).to(projected)[:, None]], 1)
-
-        return self.by_neighbors(project, cloud, self.reach, batch_size)
-
-    def spheres(self, cloud: Tensor, batch_size: int | None = None) -> Work:
-        """As `projections`, but to the sphere that fits the nearest points, without network and expected error."""
-
-        def project(query: Tensor, cloud: Tensor, idx: Tensor) -> Tensor:
-            near, like = cloud[idx], self.projector.out.weight
-            offsets = near[..., :3] - query[:, None, :3]
-            step, normal = (x.to(query) for x in feet(*(x.to(like) for x in (offsets, near[..., 3:], query[:, 3:]))))
-            return torch.cat([query[:, :3] + step, normal, torch.zeros_like(step[:, :1])], 1)
-
-        return self.by_neighbors(project, cloud, CLOSE, batch_size)
-
-    def by_neighbors(
-        self, project: Callable[[Tensor, Tensor, Tensor], Tensor], cloud: Tensor, k: int, batch_size: int | None
-    ) -> Work:
-        """project(queries (m, 6), cloud (n, 6), their k nearest points as idx (m, k)), for queries in batches.
-
-        On the CPU each thread works on batches of its own, so the result does not depend on their number.
-        """
-        cloud = cloud[along_curve(cloud[:, :3])].to(self.projector.out.weight.device)
-        search, size, on_cpu = Search(cloud[:, :3]), self.batch(cloud, batch_size), cloud.device.type == "cpu"
-
-        def work(query: Tensor) -> Tensor:
-            query = query.to(cloud)
-            idx = search.knn(query[:, :3], min(k, len(cloud))).idx
-            batches = [slice(start, start + size) for start in range(0, len(query), size)]
-
-            def batch(part: slice) -> Tensor:
-                return project(query[part], cloud, idx[part])
-
-            return torch.cat(threads.spread(batch, batches) if on_cpu else [batch(part) for part in batches])
-
-        return work
-
-    @staticmethod
-    def batch(cloud: Tensor, batch_size: int | None) -> int:
-        """Queries at once."""
-        return batch_size or (BATCH if cloud.device.type == "cpu" else 2**16)
-
-
-def noise_in_spacings(cloud: Tensor) -> float:
-    """Noise of a cloud (n, 6) in units of the spacing of its points."""
-    return noise_level(cloud[:, :3], cloud[:, 3:]) / spacing(cloud[:, :3].cpu().numpy())
-
-
-def seeds_around(cloud: Tensor, each: int, count: int, step: Step = silent) -> Tensor:
-    """Points of a cloud (n, 6) and `each` seeds around each, thinned to (count, 6), with the points' normals."""
-    step(0, 1)
-    discs = tangent_discs(cloud[:, :3], cloud[:, 3:], each)
-    places = torch.cat([cloud[:, :3], discs.flatten(0, 1)])
-    del discs
-    if len(places) <= count:
-        kept = torch.arange(len(places), device=cloud.device)
-        step(1, 1)
-    else:
-        kept = torch.from_numpy(farthest_points_large(places, count, step=step)).to(cloud.device)
-    owner = torch.where(kept < len(cloud), kept, (kept - len(cloud)) // each)
-    return torch.cat([places[kept], cloud[owner, 3:]], 1)
-
-
-def spared(points: Tensor, error: Tensor, count: int) -> Tensor:
-    """Indices (count,), ascending, of the points (m, 3) that stay when those of the highest error (m,) are dropped.
-
-    Of neighbours only the worst goes, as long as there are others to drop: a bad point without its surroundings would
-    be a hole.
-    """
-    surplus = len(points) - count
-    doubtful = error.argsort(descending=True, stable=True)[: DOUBTFUL * surplus]
-    around = knn(points[None, doubtful], points[None], min(AROUND, len(points))).idx[0]
-    worst = error[doubtful] >= error[around].amax(1)
-    stays = torch.ones_like(error, dtype=torch.bool)
-    stays[torch.cat([doubtful[worst], doubtful[~worst]])[:surplus]] = False
-    return stays.nonzero()[:, 0]
-
-
-def evened(cloud: Tensor, steps: int, step: Step = silent) -> Tensor:
-    """A cloud (m, 6) with points moved to an even spacing."""
-    return torch.cat([repel(cloud[:, :3], cloud[:, 3:], steps=steps, step=step), cloud[:, 3:]], 1)
-
-
-def thin(cloud: Tensor, count: int, step: Step = silent) -> Tensor:
-    """Farthest points of a cloud (n, 6): (min(n, count), 6)."""
-    if len(cloud) <= count:
-        return cloud
-    return cloud[torch.from_numpy(farthest_points_large(cloud[:, :3], count, step=step)).to(cloud.device)]
+        """As in training: patch (B, n, 6) -> (B, queries, 6). Whole clouds are for `pnu.upsamplers.surface`."""
+        return self.outputs(patch)["prediction"]

@@ -9,27 +9,22 @@ from torch import Tensor
 
 from pnu.io import atomic_path
 
-Keep = Callable[[str, Callable[[], Tensor]], Tensor]
-"""keep(name, compute): the tensor that `compute` gives, now or earlier under this name."""
-
-
-def forget(name: str, compute: Callable[[], Tensor]) -> Tensor:
-    """Keeps nothing."""
-    return compute()
-
 
 class Parts:
-    """Keeps tensors in a folder, each in a file that is there whole or not at all."""
+    """Tensors by name, each in a file of a folder that is there whole or not at all; without a folder none is kept."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path | None = None) -> None:
         self.folder = folder
-        folder.mkdir(parents=True, exist_ok=True)
 
-    def __call__(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
+    def get(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
+        """The tensor that `compute` gives, now or earlier under this name."""
+        if self.folder is None:
+            return compute()
         path = self.folder / f"{name}.npy"
         if path.is_file():
             return torch.from_numpy(np.load(path, allow_pickle=False))
         values = compute()
+        self.folder.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary:
             np.save(temporary, values.cpu().numpy())
         return values

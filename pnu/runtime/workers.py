@@ -18,53 +18,55 @@ from itertools import count, repeat
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 Work = Callable[[Tensor], Tensor]
 """What is made of one part."""
-Begin = Callable[[Tensor], Work]
-"""begin(cloud): the work on parts of this cloud; what all parts need, such as a tree, is made once."""
+Begin = Callable[[Any, Tensor], Work]
+"""begin(network, cloud): the work on parts of this cloud; what all parts need, such as a tree, is made once."""
 
 
 class Workers(Protocol):
-    def map(self, cloud: Tensor, parts: Sequence[Tensor]) -> Iterator[Tensor]:
-        """The work on each part of a cloud, in order."""
+    """Who works, each with a network."""
+
+    def map(self, begin: Begin, cloud: Tensor, parts: Sequence[Tensor]) -> Iterator[Tensor]:
+        """The work on each part of a cloud, in order. `begin` is the same object as long as the work is the same."""
 
 
-class Here:
+class InProcess:
     """Works in this process."""
 
-    def __init__(self, begin: Begin) -> None:
-        self.begin = begin
-        self.cloud: Tensor | None = None
+    def __init__(self, network: nn.Module) -> None:
+        self.network = network
+        self.begun: tuple[Begin, Tensor] | None = None
 
-    def map(self, cloud: Tensor, parts: Sequence[Tensor]) -> Iterator[Tensor]:
-        if cloud is not self.cloud:
-            self.cloud, self.work = cloud, self.begin(cloud)
+    def map(self, begin: Begin, cloud: Tensor, parts: Sequence[Tensor]) -> Iterator[Tensor]:
+        if self.begun is None or self.begun[0] is not begin or self.begun[1] is not cloud:
+            self.begun, self.work = (begin, cloud), begin(self.network, cloud)
         return map(self.work, parts)
 
 
 class Processes:
     """Works in processes of their own, one for each of `devices`; a context.
 
-    make(device) -> Begin is pickled and called in each. Clouds go there through a file that all map, so they share its
-    memory; parts and results through pipes. The threads of torch are shared out. An error becomes a `ValueError` of one
-    line. A process ends with this one, however that ends.
+    The network, which lies on the CPU, and what begins the work are pickled. Clouds go there through a file that all
+    map, so they share its memory; parts and results through pipes. The threads of torch are shared out. An error
+    becomes a `ValueError` of one line. A process ends with this one, however that ends.
     """
 
-    def __init__(self, make: Callable[[str], Begin], devices: Sequence[str]) -> None:
+    def __init__(self, network: nn.Module, devices: Sequence[str]) -> None:
         self.devices = devices
         context = multiprocessing.get_context("spawn")  # CUDA and threads do not survive a fork
         names = context.SimpleQueue()
         for device in devices:
             names.put(device)
         share = max(1, torch.get_num_threads() // len(devices))
-        self.pool = ProcessPoolExecutor(len(devices), context, _start, (pickle.dumps(make), names, share))
+        self.pool = ProcessPoolExecutor(len(devices), context, _start, (pickle.dumps(network), names, share))
         self.cloud: Tensor | None = None
         self.path, self.number = Path(), count()
 
@@ -79,13 +81,14 @@ class Processes:
         self.pool.shutdown(cancel_futures=True)
         self.folder.cleanup()
 
-    def map(self, cloud: Tensor, parts: Sequence[Tensor]) -> Iterator[Tensor]:
+    def map(self, begin: Begin, cloud: Tensor, parts: Sequence[Tensor]) -> Iterator[Tensor]:
         if cloud is not self.cloud:
             self.cloud, self.path = cloud, Path(self.folder.name) / f"{next(self.number)}.npy"
             np.save(self.path, cloud.cpu().numpy())
         try:
             tasks = (part.cpu().numpy() for part in parts)
-            yield from map(torch.from_numpy, self.pool.map(_work, repeat(str(self.path)), tasks))
+            found = self.pool.map(_work, repeat(pickle.dumps(begin)), repeat(str(self.path)), tasks)
+            yield from map(torch.from_numpy, found)
         except BrokenProcessPool:
             raise ValueError(
                 f"devices={len(self.devices)}: a process ended amid its work; with too little memory, take fewer. "
@@ -106,20 +109,21 @@ def sigint_ignored() -> Iterator[None]:
 
 
 class _Worker:
-    """What one of the processes has: a device, and the work on the cloud that came last."""
+    """What one of the processes has: a network on its device, and the work that came last."""
 
-    def __init__(self, make: bytes, device: str) -> None:
-        self.make, self.device = make, device
-        self.begin: Begin | None = None
-        self.cloud = ""
+    def __init__(self, network: bytes, device: str) -> None:
+        self.pickled, self.device = network, device
+        self.network: nn.Module | None = None
+        self.begun = (b"", "")
 
-    def __call__(self, cloud: str, part: NDArray) -> NDArray:
+    def __call__(self, begin: bytes, cloud: str, part: NDArray) -> NDArray:
         try:
-            if self.begin is None:
-                self.begin = pickle.loads(self.make)(self.device)
-            if cloud != self.cloud:
-                self.work: Work = self.begin(torch.from_numpy(np.load(cloud, mmap_mode="c")))
-                self.cloud = cloud
+            if self.network is None:
+                self.network = pickle.loads(self.pickled).to(self.device)
+            if (begin, cloud) != self.begun:
+                points = torch.from_numpy(np.load(cloud, mmap_mode="c"))
+                self.work: Work = pickle.loads(begin)(self.network, points)
+                self.begun = begin, cloud
             return self.work(torch.from_numpy(part)).cpu().numpy()
         except ValueError:
             raise
@@ -131,9 +135,9 @@ class _Worker:
 _worker: _Worker
 
 
-def _start(make: bytes, names: "SimpleQueue[str]", threads: int) -> None:
+def _start(network: bytes, names: "SimpleQueue[str]", threads: int) -> None:
     global _worker
-    _worker = _Worker(make, names.get())
+    _worker = _Worker(network, names.get())
     torch.set_num_threads(threads)
     torch.set_grad_enabled(False)
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -146,5 +150,5 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _work(cloud: str, part: NDArray) -> NDArray:
-    return _worker(cloud, part)
+def _work(begin: bytes, cloud: str, part: NDArray) -> NDArray:
+    return _worker(begin, cloud, part)

@@ -1,5 +1,6 @@
 """Upsamplers without training: exact where they must be, and as good as they are known to be."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -7,8 +8,9 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from pnu import classical, inference, metrics
+from pnu import inference, metrics
 from pnu.io import read_cloud, read_mesh
+from pnu.upsamplers import APSS, Context, Midpoint, classical
 
 FAST = ("apss", "midpoint")
 
@@ -26,7 +28,7 @@ def sphere(n: int, seed: int = 0) -> np.ndarray:
 @pytest.mark.parametrize("name", FAST)
 def test_count_frame_and_normals(name: str, ratio: float) -> None:
     normals = sphere(300)
-    dense = inference.upsample(50 * normals + 1e5, normals, ratio=ratio, model=classical.method(name))
+    dense = inference.upsample(50 * normals + 1e5, normals, ratio=ratio, model=classical(name))
     assert dense.shape == (round(300 * ratio), 6)
     assert len(np.unique(dense[:, :3], axis=0)) == len(dense)
     offset = (dense[:, :3] - 1e5) / 50
@@ -44,7 +46,7 @@ def test_count_frame_and_normals(name: str, ratio: float) -> None:
 def test_seed(name: str) -> None:
     normals = sphere(200)
     one, same, other = (
-        inference.upsample(normals, normals, ratio=3, model=classical.method(name), seed=seed) for seed in (0, 0, 1)
+        inference.upsample(normals, normals, ratio=3, model=classical(name), seed=seed) for seed in (0, 0, 1)
     )
     np.testing.assert_array_equal(one, same)
     assert np.array_equal(one, other) == (name == "midpoint")
@@ -52,7 +54,7 @@ def test_seed(name: str) -> None:
 
 @pytest.mark.parametrize("name", FAST)
 def test_without_normals(name: str) -> None:
-    dense = inference.upsample(sphere(500), ratio=2, model=classical.method(name))
+    dense = inference.upsample(sphere(500), ratio=2, model=classical(name))
     assert (dense[:, :3] * dense[:, 3:]).sum(1).min() > 0.8
 
 
@@ -60,11 +62,7 @@ def test_midpoints_by_hand() -> None:
     square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
     normals = torch.tensor([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, 1, 0]], dtype=torch.float64)
     cloud = torch.cat([square, normals], 1)
-    dense = (
-        classical.Midpoint(3)
-        .upsample_cloud(cloud, 6, batch_size=None, generator=torch.Generator(), progress=quiet)
-        .tolist()
-    )
+    dense = Midpoint(3).upsample_cloud(cloud, 6, Context(progress=quiet)).tolist()
     half = 0.5**0.5
     expected = {
         (0.5, 0, 0): (half, half, 0), (1, 0.5, 0): (-half, half, 0), (0.5, 1, 0): (-half, half, 0),
@@ -82,14 +80,14 @@ def test_midpoints_by_hand() -> None:
 def test_apss_fills_a_hole_of_the_sampling() -> None:
     normals = sphere(1500)
     normals = normals[normals[:, 2] < np.cos(0.12)]  # a hole of three spacings
-    dense = inference.upsample(normals, normals, ratio=4, model=classical.method("apss"))
+    dense = inference.upsample(normals, normals, ratio=4, model=classical("apss"))
     assert cKDTree(dense[:, :3]).query([0, 0, 1])[0] < 0.08 < cKDTree(normals).query([0, 0, 1])[0]
 
 
 def test_poisson_surface() -> None:
     pytest.importorskip("open3d")
     normals = sphere(2000)
-    dense = inference.upsample(normals, normals, ratio=2, model=classical.method("poisson"))
+    dense = inference.upsample(normals, normals, ratio=2, model=classical("poisson"))
     assert dense.shape == (4000, 6)
     np.testing.assert_allclose(np.linalg.norm(dense[:, :3], axis=1), 1, atol=0.01)
     assert (dense[:, :3] * dense[:, 3:]).sum(1).min() > 0.98
@@ -100,13 +98,27 @@ def test_poisson_makes_no_bubble_at_an_open_border() -> None:
     pytest.importorskip("open3d")
     normals = sphere(4000)
     normals = normals[normals[:, 2] > 0]
-    dense = inference.upsample(normals, normals, ratio=2, model=classical.method("poisson"))
+    dense = inference.upsample(normals, normals, ratio=2, model=classical("poisson"))
     assert cKDTree(normals).query(dense[:, :3])[0].max() < 0.25
+
+
+@pytest.mark.parametrize("name", FAST)
+def test_names_are_models(name: str) -> None:
+    normals = sphere(100)
+    dense = inference.upsample(normals, normals, model=name)
+    np.testing.assert_array_equal(dense, inference.upsample(normals, normals, model=classical(name)))
+
+
+@pytest.mark.parametrize("make", [lambda: Midpoint(0), lambda: APSS(3), lambda: APSS(seeds=1), lambda: APSS(reach=1)])
+def test_too_few_neighbors_are_refused(make: Callable[[], object]) -> None:
+    """They would give no points, and without new ones midpoints go on for ever."""
+    with pytest.raises(ValueError, match=r"^(neighbours|seeds|reach)=\d: expected at least \d$"):
+        make()
 
 
 def test_unknown_method() -> None:
     with pytest.raises(ValueError, match="method=aps: expected one of apss, poisson, midpoint"):
-        classical.method("aps")
+        classical("aps")
 
 
 @pytest.mark.slow
@@ -114,7 +126,7 @@ def test_apss_is_as_good_as_known(shared: Path) -> None:
     found = []
     for shape in ("casting", "duck", "fandisk", "camel", "elephant", "kitten"):
         points, normals, *_ = read_cloud(shared / "bench" / "clouds" / f"{shape}.xyz")
-        dense = inference.upsample(points, normals, model=classical.method("apss"))
+        dense = inference.upsample(points, normals, model=classical("apss"))
         truth = np.load(shared / "bench" / "truth" / f"{shape}_20000.npy")
         close = metrics.compare_mesh(dense, read_mesh(shared / "bench" / "truth" / f"{shape}.ply"))
         far = metrics.compare(dense, truth)

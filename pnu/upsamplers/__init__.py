@@ -1,0 +1,28 @@
+"""Upsamplers: a cloud, a count and a context go in, a cloud comes out. One file each.
+
+patches     the paper's procedure, for networks of patches
+surface     seeds, spheres, learned projection, even spacing, rejection, for networks that project
+apss, poisson, midpoint     without a network
+"""
+
+from pnu.upsamplers.apss import APSS
+from pnu.upsamplers.context import Context, Upsampler
+from pnu.upsamplers.midpoint import Midpoint
+from pnu.upsamplers.patches import Patches
+from pnu.upsamplers.poisson import PoissonSurface
+from pnu.upsamplers.selection import CLASSICAL, classical, dense_patches, upsampler_of
+from pnu.upsamplers.surface import SurfaceProjection
+
+__all__ = [
+    "APSS",
+    "CLASSICAL",
+    "Context",
+    "Midpoint",
+    "Patches",
+    "PoissonSurface",
+    "SurfaceProjection",
+    "Upsampler",
+    "classical",
+    "dense_patches",
+    "upsampler_of",
+]

@@ -1,0 +1,164 @@
+"""The paper's procedure (section Inference): patches through the network, farthest points of all predictions."""
+
+import math
+from functools import partial
+from numbers import Integral
+
+import torch
+from torch import Tensor, nn
+
+from pnu.ops import patches
+from pnu.ops.nearest import nearest
+from pnu.ops.normalize import unit_sphere_frame
+from pnu.ops.normals import estimate_normals, flip_to_reference
+from pnu.runtime import threads
+from pnu.runtime.workers import Begin, InProcess, Work, Workers
+from pnu.upsamplers.context import Context
+
+SMALLEST_PATCH = 64  # points that every network accepts; a smaller cloud is repeated up to it
+SLACK = 1.1  # growth beyond the network's ratio for which overlapping patches have points enough
+KEPT = 256  # patches whose predictions are kept in one file
+BATCHES = 32  # on a CPU, that its threads share
+ZERO = 1e-6  # predicted normals shorter than this have no direction
+
+
+class Patches:
+    """For a network of patches (B, n, 6) -> (B, ratio n, 6 or 3), in passes of `ratio` times as many points each.
+
+    In addition to the paper every point lies in a patch, passes are repeated for ratios beyond the network's, and a
+    small cloud fills a patch by repetition. Nothing is random. The cloud stays on the CPU, in float64; patches go to
+    the network in its own type and device.
+
+    Args:
+        network: with an attribute `ratio`.
+        patch_size: points of a patch; None: what the network says, or 1024.
+
+    Raises:
+        ValueError: the network has no ratio.
+    """
+
+    parallel = True
+
+    def __init__(self, network: nn.Module, patch_size: int | None = None) -> None:
+        self.network = network
+        ratio = getattr(network, "ratio", None)
+        if not (isinstance(ratio, Integral) and int(ratio) >= 1):
+            raise ValueError(
+                "model: expected a network with an attribute `ratio`, the points out for each point in, a whole number "
+                f">= 1; found {ratio!r}"
+            )
+        self.ratio = int(ratio)
+        self.patch_size = patch_size or int(getattr(network, "patch_size", 1024))
+
+    def upsample_cloud(self, cloud: Tensor, count: int, context: Context) -> Tensor:
+        """cloud (n, 6) -> (count, 3 or 6) on the CPU."""
+        cloud = cloud.cpu()
+        begin = partial(predictions, batch_size=context.batch_size)
+        run = partial(self._one_pass, begin, context.workers or InProcess(self.network), context)
+        *before, last = self.pass_sizes(len(cloud), count)
+        for size in before:
+            cloud = with_unit_normals(run(cloud, size), cloud)
+        return run(cloud, last)
+
+    def pass_sizes(self, n: int, count: int) -> list[int]:
+        """Number of points after each pass from n to count: as few passes as possible, all with the same growth."""
+        if self.ratio == 1 and count > n:
+            raise ValueError(
+                f"model: a network of ratio 1 makes no more points than it gets, {count} of {n} were asked for; leave "
+                "ratio=1, or take a network of ratio 2 or more"
+            )
+        reach = self.ratio * (SLACK if n > self.patch_size else 1)
+        passes = 1
+        while count > n * reach**passes:
+            passes += 1
+        sizes = [n]
+        for i in range(1, passes):
+            sizes.append(min(math.ceil(n * (count / n) ** (i / passes)), self.ratio * sizes[-1]))
+        return [*sizes[1:], count]
+
+    def _one_pass(self, begin: Begin, workers: Workers, context: Context, cloud: Tensor, count: int) -> Tensor:
+        """The network on patches of the cloud (n, 6), and farthest points of all it predicts: (count, 3 or 6)."""
+        n, size = len(cloud), min(self.patch_size, len(cloud))
+        centers = 1 if size == n else max(1, round(self.ratio * n / size))
+        stage = f"network, {n} points"
+        context.progress(stage, 0, centers)
+        idx = patches.extract(cloud, centers, size, cover=True)
+        if size < SMALLEST_PATCH:
+            idx = idx[:, torch.arange(SMALLEST_PATCH) % size]
+        like = example(self.network)
+        together = patches_at_once(like, context.batch_size) * (BATCHES if like.device.type == "cpu" else 1)
+
+        def predict(first: int) -> Tensor:
+            found = []
+            for number, part in enumerate(workers.map(begin, cloud, idx[first : first + KEPT].split(together)), 1):
+                found.append(part)
+                context.progress(stage, min(first + number * together, len(idx)), len(idx))
+            return torch.cat(found)
+
+        predicted = torch.empty(0)
+        for first in range(0, len(idx), KEPT):
+            found = context.parts.get(f"{stage}, patch {first}", partial(predict, first))
+            each = len(found) // min(KEPT, len(idx) - first)  # points of a patch
+            if not first:
+                predicted = found.new_empty(len(idx) * each, found.shape[1])
+            predicted[first * each : first * each + len(found)] = found
+        context.progress(stage, len(idx), len(idx))
+        stage = f"farthest points, {count} of {len(predicted)}"
+        return patches.merge(_finite(predicted)[None], count, partial(context.progress, stage))
+
+
+def predictions(network: nn.Module, cloud: Tensor, batch_size: int | None = None) -> Work:
+    """Of a cloud (n, 6): patches idx (p, size) -> their predictions, one after the other, in the cloud's frame.
+
+    On the CPU each thread works on patches of its own. That is faster than many threads in one operation, and the last
+    digit of a matrix product, which may decide between two farthest points, depends on nothing else.
+    """
+    like = example(network)
+    on_cpu, size = like.device.type == "cpu", patches_at_once(like, batch_size)
+
+    def predict(idx: Tensor) -> Tensor:
+        patch = cloud[idx]
+        frame = unit_sphere_frame(patch)  # in float64, so that float32 has only the patch to resolve
+        dense = frame.from_unit(network(frame.to_unit(patch).to(like)).cpu().double())
+        return dense.flatten(0, 1)
+
+    def work(idx: Tensor) -> Tensor:
+        batches = idx.split(size)
+        return torch.cat(threads.spread(predict, batches) if on_cpu else [predict(batch) for batch in batches])
+
+    return work
+
+
+def example(network: nn.Module) -> Tensor:
+    """A tensor of the network's type, on its device."""
+    return next(network.parameters(), torch.empty(0))
+
+
+def patches_at_once(like: Tensor, batch_size: int | None) -> int:
+    return 1 if like.device.type == "cpu" else batch_size or 64
+
+
+def with_unit_normals(dense: Tensor, sparse: Tensor) -> Tensor:
+    """Predictions (m, 3) or (m, 6) with unit normals, (m, 6); `sparse` (n, 6) is the cloud they were made from.
+
+    A predicted normal without direction becomes that of the nearest input point. Where none are predicted they are
+    estimated from the predicted points, with the side of the nearest input normal.
+    """
+    points = _finite(dense)[:, :3]
+    if dense.shape[1] == 3:
+        normals = estimate_normals(points[None], orient=False)
+        normals = flip_to_reference(normals, points[None], sparse[None, :, :3], sparse[None, :, 3:])[0]
+    else:
+        normals = dense[:, 3:6]
+    length = normals.norm(dim=1, keepdim=True)
+    lost = (~(length > ZERO) | length.isinf()).squeeze(1)  # NaN counts as lost
+    normals = normals / length
+    if bool(lost.any()):
+        normals[lost] = sparse[nearest(points[None, lost], sparse[None, :, :3]).idx[0], 3:]
+    return torch.cat([points, normals], 1)
+
+
+def _finite(prediction: Tensor) -> Tensor:
+    if not bool(torch.isfinite(prediction[:, :3]).all()):
+        raise ValueError("model: predicted points that are NaN or infinite; its weights are damaged, train it again")
+    return prediction

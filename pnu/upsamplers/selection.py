@@ -1,0 +1,48 @@
+"""Which upsampler a model or a name means."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pnu.upsamplers.apss import APSS
+from pnu.upsamplers.context import Context, Upsampler
+from pnu.upsamplers.midpoint import Midpoint
+from pnu.upsamplers.patches import Patches
+from pnu.upsamplers.poisson import PoissonSurface
+from pnu.upsamplers.surface import SurfaceProjection
+
+CLASSICAL: dict[str, type[Upsampler]] = {"apss": APSS, "poisson": PoissonSurface, "midpoint": Midpoint}
+"""Upsamplers without training, by name."""
+
+
+def classical(name: str) -> Upsampler:
+    """An upsampler without training by name: apss, poisson or midpoint."""
+    if name not in CLASSICAL:
+        raise ValueError(f"method={name}: expected one of {', '.join(CLASSICAL)}")
+    return CLASSICAL[name]()
+
+
+def upsampler_of(model: Any, patch_size: int | None = None) -> Upsampler:
+    """The upsampler that works with a model.
+
+    One that has `upsample_cloud` is an upsampler itself. A network says by its attribute `procedure` which one is made
+    for it: "surface" for networks that project points; without it "patches", of `patch_size` points if not None.
+    """
+    if hasattr(model, "upsample_cloud"):
+        return model
+    return SurfaceProjection(model) if is_projection(model) else Patches(model, patch_size)
+
+
+def is_projection(network: Any) -> bool:
+    return getattr(network, "procedure", "patches") == "surface"
+
+
+def dense_patches(network: Any, patches: Tensor) -> Tensor:
+    """What comes out for patches in the network's frame: (B, n, 6) -> (B, ratio n, 6), or (B, ratio n, 3)."""
+    if not is_projection(network):
+        return network(patches)
+    upsampler, count = SurfaceProjection(network), network.ratio * patches.shape[1]
+    context = Context(device=patches.device)
+    with torch.no_grad():
+        return torch.stack([upsampler.upsample_cloud(cloud, count, context) for cloud in patches])
