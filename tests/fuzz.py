@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import warnings
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -53,7 +54,10 @@ def read_cloud(path: Path) -> None:
     assert cloud.points.shape == (n, 3)
     assert np.isfinite(cloud.points).all()
     if cloud.normals is not None:
-        assert np.allclose(np.linalg.norm(cloud.normals, axis=1), 1)
+        lengths = np.linalg.norm(cloud.normals, axis=1)
+        assert (np.isnan(lengths) | np.isclose(lengths, 1)).all()
+        assert not np.isnan(lengths).all()
+    assert all("\n" not in note and len(note) < 1000 for note in cloud.notes)
     assert all(len(values) == n for values in cloud.attributes.values())
 
 
@@ -339,8 +343,73 @@ def npy_files(draw: st.DrawFn) -> bytes:
 
 @st.composite
 def text_files(draw: st.DrawFn) -> bytes:
-    separator = draw(st.sampled_from([" ", ",", ";", "\t", "//", "\r", "\0"]))
-    return draw(body).replace(b" ", separator.encode())
+    """Titles, names, counts and comments before lines that have separators, decimal commas, words and holes."""
+    separator = draw(st.sampled_from([" ", ",", ", ", ";", "\t", "//", "\r", "\0"]))
+    width = draw(st.integers(3, 11))
+    word = st.sampled_from(["x", "Y", "z", "nx", "ny", "Nz", "r", "G", "b", "i", "_", "", "lon", "lat", "a [m]", '"q"'])
+    head = st.sampled_from(
+        ["", "20", "30", "-1", "1e3", "99999999999999999999", "# x y z i", "//X,Y,Z", "a title", "% 3"]
+    )
+    rng = np.random.default_rng(draw(st.integers(0, 99)))
+    table = rng.normal(size=(20, width))
+    for _ in range(draw(st.integers(0, 2))):
+        at = draw(st.integers(0, width - 1))
+        table[:, at : at + 3] = draw(st.sampled_from([0, 1, 255, np.nan, 1e30])) * np.ones_like(table[:, at : at + 3])
+    table = np.rint(table * 50) if draw(st.booleans()) else table
+    rows = [[f"{value:.6g}" for value in row] for row in table]
+    for _ in range(draw(st.integers(0, 3))):
+        rows[draw(st.integers(0, 19))][draw(st.integers(0, width - 1))] = draw(number | word)
+    lines = draw(st.lists(head | st.lists(word, max_size=width + 1).map(separator.join), max_size=3))
+    text = "\n".join([*lines, *(separator.join(row) for row in rows)]) + "\n"
+    if draw(st.booleans()):
+        text = text.replace(".", draw(st.sampled_from([",", ".", ""])))
+    whole = text.encode(draw(st.sampled_from(["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"])))
+    return draw(
+        st.sampled_from([whole, whole[: draw(st.integers(0, len(whole)))]])
+        | body.map(lambda data: data.replace(b" ", separator.encode()))
+    )
+
+
+def ptx_examples() -> list[bytes]:
+    points = np.random.default_rng(0).normal(size=(20, 4))
+    head = "5\n4\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
+    scan = head + "".join("{:.3f} {:.3f} {:.3f} {:.3f}\n".format(*row) for row in points)
+    return [scan.encode(), (scan + scan.replace("0 0 0 1", "3 2 1 1")).encode()]
+
+
+@st.composite
+def ptx_files(draw: st.DrawFn) -> bytes:
+    rows = "0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
+    many = st.lists(st.builds("{}\n{}\n".format, count, count), max_size=2)
+    return "".join(head + draw(st.sampled_from([rows, ""])) for head in draw(many)).encode() + draw(body)
+
+
+def npz_examples() -> list[bytes]:
+    points, normals = np.random.default_rng(0).normal(size=(2, 20, 3))
+    made = []
+    for save, arrays in (
+        (np.savez, {"points": points, "normals": normals, "label": np.arange(20)}),
+        (np.savez_compressed, {"scan": np.hstack([points, np.arange(60).reshape(20, 3)])}),
+        (np.savez, {"x": points[:, 0], "y": points[:, 1], "z": points[:, 2]}),
+    ):
+        save(buffer := io.BytesIO(), **arrays)  # type: ignore[operator]
+        made.append(buffer.getvalue())
+    return made
+
+
+@st.composite
+def npz_files(draw: st.DrawFn) -> bytes:
+    """Archives whose arrays have any names, shapes and types, and members that are no arrays."""
+    name = st.sampled_from(["points", "xyz", "normals", "colors", "x", "y", "z", "a", "points/b", "é"])
+    with zipfile.ZipFile(buffer := io.BytesIO(), "w", draw(st.sampled_from([0, 8, 12, 14]))) as archive:
+        for one in draw(st.sets(name, max_size=4)):
+            shape = draw(st.sampled_from([(20, 3), (20, 6), (4, 5, 3), (20,), (0, 3), (20, 2), ()]))
+            kind = draw(st.sampled_from(["f8", "f4", "u1", "i8", "c8", "U3", "?", "f2", [("x", "f8"), ("y", "f8")]]))
+            np.save(member := io.BytesIO(), np.random.default_rng(1).integers(0, 9, shape).astype(np.dtype(kind)))
+            archive.writestr(
+                one + draw(st.sampled_from([".npy", ".npy", ""])), draw(st.just(member.getvalue()) | npy_files())
+            )
+    return buffer.getvalue()
 
 
 @st.composite
@@ -567,6 +636,11 @@ READERS = {
     "obj": of_clouds(".obj", obj_files()),
     "off": of_clouds(".off", off_files()),
     "npy": of_clouds(".npy", npy_files()),
+    "npz": Reader(".npz", read_cloud, npz_examples, npz_files()),
+    "pts": Reader(".pts", read_cloud, cloud_files(".xyz"), text_files()),
+    "csv": Reader(".csv", read_cloud, cloud_files(".xyz"), text_files()),
+    "pwn": Reader(".pwn", read_cloud, cloud_files(".xyz"), text_files()),
+    "ptx": Reader(".ptx", read_cloud, ptx_examples, ptx_files()),
     "las": of_clouds(".las", las_files()),
     "laz": of_clouds(".laz", las_files()),
     "ply mesh": of_meshes(".ply", ply_files()),

@@ -37,6 +37,7 @@ BAD_CLOUDS = {
     "counted.pts": (f"30\n{ROWS}".encode(), "promises 30 points, holds 20; it is cut off"),
     "commas.csv": (b"1,05,-2,50,3,75\n" * 20, "line 1: commas stand between numbers and within them; write decimal"),
     "cut.ptx": (b"5\n4\n" + b"0 0 0\n" * 4 + b"1 0 0 0\n" * 4 + b"1 2 3 0.5\n" * 19, "promises 20 points, holds 19"),
+    "endless.ptx": (b"99999999999999999999\n1\n" + b"0 0 0\n" * 4 + b"1 0 0 0\n" * 4, "promises 99999999999999999999"),
     "pts.ptx": (ROWS.encode(), "expected ptx: two counts"),
     "text.npz": (b"PK\x03\x04" + bytes(99), "is no npz file of numbers"),
     "comments.xyz": (b"# nothing\n" * 20, "holds no numbers"),

@@ -229,7 +229,7 @@ def read_ptx(path: Path) -> Text:
                 f"{path}: expected ptx: two counts, four lines of 3 numbers and four of 4 before the points; "
                 "is it a pts or xyz file?"
             ) from None
-        rows = list(islice(lines, size))
+        rows = list(islice(lines, min(size, path.stat().st_size)))
         if len(rows) < size:
             raise ValueError(f"{path}: promises {size} points, holds {len(rows)}; it is cut off, copy it again")
         values = table(path, lambda rows=rows: rows)  # type: ignore[misc]
