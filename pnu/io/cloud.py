@@ -19,6 +19,7 @@ from pnu.io.text import open_file
 
 TEXTS = (".xyz", ".txt", ".pts", ".asc", ".csv", ".tsv", ".pwn", ".xyzn", ".xyzrgb")
 LARGEST = 1e30  # beyond, squared distances leave the range of float64 or what float32 can hold after scaling
+UNSEEN = 10  # times that the origin is given as often as other places
 STEEP = 500  # times that z spans x and y where these are degrees
 LENGTH = 0.05  # by which that of a unit normal may differ from 1, as text rounds it
 
@@ -88,10 +89,15 @@ def check_cloud(cloud: Cloud, name: str, *, minimum: int = 16) -> Cloud:
     if count > 1 and np.ptp(cloud.points, axis=0).max() <= max(1e-12 * np.abs(cloud.points).max(), 1 / LARGEST):
         raise ValueError(f"{name}: all {count} points are equal; expected points on a surface")
     first = first_of_each_place(cloud.points, cloud.normals)
+    unseen = (cloud.points == 0).all(axis=1)
+    if unseen.sum() > UNSEEN * count / len(first):  # far more often than any place is repeated
+        notes.append(f"{unseen.sum()} of {count} points left out: 0 0 0, where a sensor saw nothing")
+        count, first = count - unseen.sum(), first[~unseen[first]]
     if len(first) < count:
         notes.append(f"{count - len(first)} of {count} points left out: at the place of another")
-        if len(first) < minimum:
-            raise ValueError(f"{name}: holds {len(first)} different points; at least {minimum} are needed")
+    if len(first) < minimum:
+        raise ValueError(f"{name}: holds {len(first)} different points; at least {minimum} are needed")
+    if len(first) < len(cloud.points):
         cloud = chosen(cloud, first)
     if GEOGRAPHIC not in notes and looks_geographic(cloud.points):
         notes.append(f"{GEOGRAPHIC} (so it seems, as z spans more than {STEEP} times as much)")

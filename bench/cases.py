@@ -1,0 +1,41 @@
+"""What pnu reads of each file of a folder, and what it says of it, as a table: `python -m bench.cases FOLDER`.
+
+Markdown on stdout: the file, what was read, and the lines that the commands print, or the one line of the refusal.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from pnu.io import CLOUD_SUFFIXES, Cloud, files_of, read_cloud
+from pnu.ops.survey import survey
+
+
+def contents(cloud: Cloud) -> str:
+    scalars = [name for name in cloud.attributes if name != "colors"]
+    parts = [f"{len(cloud.points)} points", *(["normals"] if cloud.normals is not None else [])]
+    return ", ".join([*parts, *(["colors"] if "colors" in cloud.attributes else []), *scalars])
+
+
+def row(path: Path) -> str:
+    try:
+        cloud = read_cloud(path)
+        read, said = contents(cloud), [*cloud.notes, *survey(cloud.points, cloud.normals).warnings()]
+    except (ValueError, OSError) as error:
+        read, said = "refused", [str(error).removeprefix(f"{path}: ")]
+    return f"| {path.name} | {read} | {'<br>'.join(said).replace('|', '/')} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path, help="whose files are read, those of its folders too")
+    files = files_of(parser.parse_args().folder, CLOUD_SUFFIXES)
+    if not files:
+        sys.exit("error: no point clouds there")
+    print("| file | read | said |\n|---|---|---|")
+    for path in files:
+        print(row(path), flush=True)
+
+
+if __name__ == "__main__":
+    main()
