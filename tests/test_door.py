@@ -48,11 +48,12 @@ def test_each_place_counts_once() -> None:
     assert cloud.notes == ("3 of 43 points left out: at the place of another",)
 
 
-def test_zeros_where_a_sensor_saw_nothing() -> None:
-    points = np.vstack([POINTS, np.zeros((30, 3))])
+@pytest.mark.parametrize("nothing", [0, 1e-9])
+def test_zeros_where_a_sensor_saw_nothing(nothing: float) -> None:
+    points = np.vstack([POINTS, np.full((30, 3), nothing)])
     cloud = check_cloud(Cloud(points, None, {}), "c")
     np.testing.assert_array_equal(cloud.points, POINTS)
-    assert cloud.notes == ("30 of 70 points left out: 0 0 0, where a sensor saw nothing",)
+    assert cloud.notes == ("30 of 70 points left out: at the origin, where a sensor saw nothing",)
     corner = np.repeat(np.vstack([POINTS, np.zeros((1, 3))]), 30, 0)  # one point of a cloud that is all repeated
     assert len(check_cloud(Cloud(corner, None, {}), "c").points) == 41
 

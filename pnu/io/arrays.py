@@ -39,7 +39,7 @@ def _table(path: Path, values: np.ndarray) -> tuple[np.ndarray | dict[str, np.nd
     if values.dtype.names:
         columns: dict[str, np.ndarray] = {}
         for name in values.dtype.names:
-            column = values[name].reshape(values.size, -1)
+            column = values[name].reshape(values.size, -1) if values.size else np.empty((0, 1))
             if column.dtype.kind in "fiu":
                 columns |= _columns(name, column)
         return columns, ()

@@ -19,6 +19,7 @@ from pnu.io.text import open_file
 
 TEXTS = (".xyz", ".txt", ".pts", ".asc", ".csv", ".tsv", ".pwn", ".xyzn", ".xyzrgb")
 LARGEST = 1e30  # beyond, squared distances leave the range of float64 or what float32 can hold after scaling
+ORIGIN = 1e-6  # of the usual distance from 0 0 0: some write a small number for zero
 UNSEEN = 10  # times that the origin is given as often as other places
 STEEP = 500  # times that z spans x and y where these are degrees
 LENGTH = 0.05  # by which that of a unit normal may differ from 1, as text rounds it
@@ -89,9 +90,10 @@ def check_cloud(cloud: Cloud, name: str, *, minimum: int = 16) -> Cloud:
     if count > 1 and np.ptp(cloud.points, axis=0).max() <= max(1e-12 * np.abs(cloud.points).max(), 1 / LARGEST):
         raise ValueError(f"{name}: all {count} points are equal; expected points on a surface")
     first = first_of_each_place(cloud.points, cloud.normals)
-    unseen = (cloud.points == 0).all(axis=1)
+    size = np.abs(cloud.points).max(axis=1)
+    unseen = size <= ORIGIN * np.median(size[first])
     if unseen.sum() > UNSEEN * count / len(first):  # far more often than any place is repeated
-        notes.append(f"{unseen.sum()} of {count} points left out: 0 0 0, where a sensor saw nothing")
+        notes.append(f"{unseen.sum()} of {count} points left out: at the origin, where a sensor saw nothing")
         count, first = count - unseen.sum(), first[~unseen[first]]
     if len(first) < count:
         notes.append(f"{count - len(first)} of {count} points left out: at the place of another")
@@ -196,7 +198,7 @@ def _from_table(path: Path, values: np.ndarray, names: list[str] | None, notes: 
     if len(names) != values.shape[1]:
         raise ValueError(f"{path}: columns={','.join(names)} are {len(names)} names, it has {values.shape[1]} columns")
     columns = {name: column for name, column in zip(names, values.T, strict=True) if name != SKIP}
-    return _from_columns(path, columns, notes)
+    return _from_columns(path, columns, notes, "say which they are: columns=x,y,z,...")
 
 
 def _read_ply(path: Path) -> Cloud:
@@ -223,10 +225,11 @@ def _read_pcd(path: Path) -> Cloud:
     return _from_columns(path, columns)
 
 
-def _from_columns(path: Path, columns: dict[str, np.ndarray], notes: tuple[str, ...] = ()) -> Cloud:
+def _from_columns(
+    path: Path, columns: dict[str, np.ndarray], notes: tuple[str, ...] = (), cure: str = "save it again"
+) -> Cloud:
     found = arranged(columns)
     if found.points is None:
-        cure = "say which they are: columns=x,y,z,..." if path.suffix.lower() in TABLES else "save it again"
         raise ValueError(f"{path}: expected points with x y z, found {' '.join(columns) or 'none'}; {cure}")
     attributes = found.others if found.colors is None else found.others | {"colors": found.colors}
     return Cloud(found.points.astype(np.float64), found.normals, attributes, (*notes, *found.notes))
