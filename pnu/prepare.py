@@ -7,6 +7,8 @@ from typing import Any
 from pnu.run import build, command, doc, shell_line
 from pnu.run.groups import Data
 
+BATCH = 20  # patches of a training step, as conf/data/patches.yaml has it
+
 
 @dataclass
 class Prepare:
@@ -26,13 +28,36 @@ def prepare(cfg: Any) -> None:
     path = Path(cfg.describe) if cfg.describe else build(cfg.data, "pnu.data").patch_file()
     if cfg.output and not cfg.describe:
         path = copied(path, Path(cfg.output))
+    figures = describe(path)
     if cfg.quiet:
         print(path)
         return
-    for name, value in describe(path).items():
+    for name, value in figures.items():
         if name != "parameters":
             print(f"{name:24s} {'-' if value is None else value if not isinstance(value, float) else f'{value:.4g}'}")
-    print(f"next: {shell_line('train', data='patches', **{'data.path': path})}")
+    print(next_line(path))
+
+
+def next_line(path: Path) -> str:
+    """The training that a file of patches is fit for, or why it is fit for none."""
+    from pnu.data.dataset import Options, split
+    from pnu.data.patchset import check
+
+    contents, usual = check(path), Options()
+    target = min(usual.target_points, contents.points)
+    points = min(usual.input_points, target // 4)
+    if points < 64:
+        return f"no training: a patch needs 256 points or more, these have {contents.points}"
+    try:
+        train = split(contents.names, contents.patches, val=0.1, test=0.1, seed=0)["train"]
+    except ValueError as error:
+        return f"no training: {error}"
+    options: dict[str, Any] = {"data.path": path}
+    if target < usual.target_points:
+        options |= {"data.input_points": points, "data.target_points": target}
+    if len(train) < BATCH:
+        options["data.batch_size"] = len(train)
+    return f"next: {shell_line('train', data='patches', **options)}"
 
 
 def copied(path: Path, output: Path) -> Path:

@@ -1,6 +1,7 @@
 """Patch files: what is cut, what is written, what is refused."""
 
 import functools
+import os
 from pathlib import Path
 
 import h5py
@@ -9,7 +10,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from pnu.data import shapes
-from pnu.data.patchset import build, check, cut_patches, describe
+from pnu.data.patchset import build, check, cut_patches, describe, different
+from pnu.io import Mesh
 from pnu.ops.surface import closest_points, face_normals
 
 MAKERS = {name: functools.partial(shapes.make, name) for name in ("washer", "dice")}
@@ -86,7 +88,10 @@ def test_describe(file: Path) -> None:
     assert figures["share_with_sharp_edges"] == 1
     assert figures["normals_of_length_1"] == 1
     assert -1 <= figures["coordinates_from"] < -0.4 < 0.4 < figures["coordinates_to"] <= 1
-    assert figures["datasets"] == "edges (5, 256, 3) float32, name (5,) text, poisson_4096 (5, 4096, 6) float32"
+    assert figures["datasets"] == (
+        "edges (5, 256, 3) float32, name (5,) text, open_edges (5,) int32, poisson_4096 (5, 4096, 6) float32"
+    )
+    assert figures["meshes_with_open_edges"] == "0 of 2"
 
 
 def cloud(n: int = 2, points: int = 128) -> np.ndarray:
@@ -104,8 +109,14 @@ def cloud(n: int = 2, points: int = 128) -> np.ndarray:
         ({"poisson_4096": cloud(points=20)}, r"must have shape .*, found \(2, 20, 6\)"),
         ({"poisson_4096": cloud()[0]}, r"must have shape .*, found \(128, 6\)"),
         ({"poisson_4096": (9 * cloud()).astype(int)}, "must hold floating-point numbers, found int64"),
-        ({"poisson_4096": np.where(cloud() > 0.9, np.nan, cloud())}, "holds NaN or infinity"),
-        ({"poisson_4096": cloud() * 2}, "must be unit normals, found lengths 2 to 2"),
+        (
+            {"poisson_4096": np.where(cloud() > 0.9, np.nan, cloud())},
+            r"patch 0 of poisson_4096 holds NaN or infinity \(and 1 more patches\)",
+        ),
+        (
+            {"poisson_4096": cloud() * [1, 1, 1, 2, 2, 2]},
+            "patch 0 .* no unit normals in columns 4 to 6, found lengths 2 to 2",
+        ),
         (
             {"poisson_4096": cloud(), "name": [b"a"]},
             r"name must have one entry for each of the 2 patches, found \(1,\)",
@@ -123,6 +134,103 @@ def test_foreign_file_is_refused_with_what_it_lacks(tmp_path: Path, content: dic
         check(path)
     assert str(raised.value).startswith(str(path))
     assert "\n" not in str(raised.value)
+
+
+def with_fault(fault: str, row: int, patches: int = 70) -> np.ndarray:
+    """Clouds of which one cannot be trained on."""
+    clouds = cloud(patches)
+    if fault == "nan":
+        clouds[row, 5, 1] = np.nan
+    elif fault == "infinite":
+        clouds[row, 127, 2] = np.inf
+    elif fault == "too large for single precision":
+        clouds[row, 0, 0] = 1e39
+    elif fault == "nan in a normal":
+        clouds[row, 9, 4] = np.nan
+    elif fault == "equal":
+        clouds[row] = clouds[row, 0]
+    elif fault == "few":
+        clouds[row, :, :3] = clouds[row, np.arange(128) % 63, :3]
+    elif fault == "no normals":
+        clouds[row, :, 3:] = 0
+    elif fault == "some normals":
+        clouds[row, ::20, 3:] = 0
+    return clouds
+
+
+@pytest.mark.parametrize("name", ["poisson_4096", "montecarlo_1024"])
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ("nan", "holds NaN or infinity;"),
+        ("infinite", "holds NaN or infinity;"),
+        ("too large for single precision", "holds NaN or infinity;"),
+        ("nan in a normal", "holds NaN or infinity;"),
+        ("equal", "has 1 different points, 64 or more are needed;"),
+        ("few", "has 63 different points, 64 or more are needed;"),
+        ("no normals", "has no unit normals in columns 4 to 6, found lengths 0 to 0;"),
+        ("some normals", "has no unit normals in columns 4 to 6, found lengths 0 to 1;"),
+    ],
+)
+@pytest.mark.parametrize("row", [0, 1, 69])
+def test_every_patch_is_checked_and_the_row_named(
+    tmp_path: Path, name: str, fault: str, message: str, row: int
+) -> None:
+    """None is in a sample of every so many, and the last is beyond the first that are read at once."""
+    path = tmp_path / "one.h5"
+    with h5py.File(path, "w") as opened:
+        opened["poisson_4096"] = cloud(70)
+        if name in opened:
+            del opened[name]
+        opened[name] = with_fault(fault, row)
+    for function in (check, describe):
+        with pytest.raises(ValueError, match=f"one.h5: patch {row} of {name} {message} mend or remove it$"):
+            function(path)
+
+
+@pytest.mark.parametrize("value", [[np.nan, 0, 0], [np.inf, 0, 0]])
+def test_edges_are_points_or_empty(tmp_path: Path, value: list[float]) -> None:
+    edges = np.full((70, 4, 3), np.nan)
+    edges[:, 0] = 0.5
+    with h5py.File(tmp_path / "edges.h5", "w") as opened:
+        opened["poisson_4096"], opened["edges"] = cloud(70), edges
+    assert check(tmp_path / "edges.h5").has_edges
+    edges[66, 1] = value
+    with h5py.File(tmp_path / "edges.h5", "r+") as opened:
+        opened["edges"][...] = edges
+    with pytest.raises(ValueError, match=r"edges.h5: patch 66 of edges holds infinity, or NaN in a part of a row"):
+        check(tmp_path / "edges.h5")
+
+
+def test_different_points_are_counted() -> None:
+    points = np.random.default_rng(0).normal(size=(3, 4096, 3)).astype(np.float32)
+    points[1, 100:] = points[1, :1]
+    points[2] = np.where(np.arange(4096)[:, None] % 2, 0.0, -0.0)
+    expected = [len(np.unique(cloud, axis=0)) for cloud in points]
+    assert expected == [4096, 100, 1]
+    assert different(points).tolist() == expected
+
+
+def test_a_file_is_read_once_until_it_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "two.h5"
+    with h5py.File(path, "w") as opened:
+        opened["poisson_4096"] = cloud()
+    assert check(path) is check(path)
+    with h5py.File(path, "r+") as opened:
+        opened["poisson_4096"][1, 3] = np.nan
+    os.utime(path, ns=(1, 1))
+    with pytest.raises(ValueError, match="patch 1"):
+        check(path)
+
+
+def test_meshes_with_open_edges_are_counted_in_the_file(tmp_path: Path) -> None:
+    def opened_dice() -> Mesh:
+        mesh = shapes.make("dice")
+        return Mesh(mesh.vertices, mesh.faces[1:])
+
+    build(tmp_path / "three.h5", {**MAKERS, "hole": opened_dice}, 4)
+    assert check(tmp_path / "three.h5").open_edges == {"dice": 0, "hole": 3, "washer": 0}
+    assert describe(tmp_path / "three.h5")["meshes_with_open_edges"] == "1 of 3: hole (3)"
 
 
 def test_no_file_and_no_hdf5(tmp_path: Path) -> None:

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from pnu.data import shapes
+from pnu.data.datamodule import PatchDataModule
 from pnu.data.patchset import check
-from pnu.io import write_mesh
+from pnu.io import Mesh, write_mesh
 from pnu.prepare import main
 from tests.commands import refused
 
@@ -57,7 +58,69 @@ def test_describe(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert (lines["patches"], lines["points"], lines["shapes"]) == ("2", "128", "-")
     assert float(lines["coordinates_from"]) == pytest.approx(cloud[..., :3].min(), rel=1e-3)
     assert lines["normals_of_length_1"] == "1"
-    assert lines["next:"] == f"python -m pnu.train data=patches data.path={tmp_path / 'foreign.h5'}"
+    assert lines["no"] == "training: a patch needs 256 points or more, these have 128"
+
+
+def patches(path: Path, number: int, points: int = 4096, shapes: int = 20) -> Path:
+    rng = np.random.default_rng(0)
+    ball = rng.normal(size=(number, points, 3))
+    ball /= np.linalg.norm(ball, axis=-1, keepdims=True)
+    with h5py.File(path, "w") as file:
+        file["poisson_4096"] = np.concatenate([ball, ball], -1).astype(np.float32)
+        file["name"] = np.array([f"ball_{i % shapes}" for i in range(number)], dtype=h5py.string_dtype())
+    return path
+
+
+@pytest.mark.parametrize(
+    ("made", "options"),
+    [
+        ((40,), ""),
+        ((12,), " data.batch_size=10"),
+        ((40, 256), " data.input_points=64 data.target_points=256"),
+        ((6, 300), " data.input_points=75 data.target_points=300 data.batch_size=4"),
+    ],
+)
+def test_the_next_line_is_a_training_that_the_file_is_fit_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], made: tuple[int, ...], options: str
+) -> None:
+    path = patches(tmp_path / "patches.h5", *made)
+    main([f"describe={path}"])
+    line = capsys.readouterr().out.splitlines()[-1]
+    assert line == f"next: python -m pnu.train data=patches data.path={path}{options}"
+    arguments = dict(word.removeprefix("data.").split("=") for word in line.split()[4:])
+    numbers = {name: int(value) for name, value in arguments.items() if value.isdigit()}
+    PatchDataModule(str(path), **numbers).setup()  # type: ignore[arg-type]
+
+
+def test_no_training_for_what_cannot_be_split(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main([f"describe={patches(tmp_path / 'patches.h5', 4, 256, shapes=2)}"])
+    line = capsys.readouterr().out.splitlines()[-1]
+    assert line.startswith("no training: data: 2 shapes cannot be split")
+
+
+@pytest.mark.parametrize("quiet", ["false", "true"])
+def test_a_file_with_one_bad_patch_is_not_recommended(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], quiet: str
+) -> None:
+    path = patches(tmp_path / "patches.h5", 40, 256)
+    with h5py.File(path, "r+") as file:
+        file["poisson_4096"][33, 7, 2] = np.nan
+    message = refused(capsys, main, [f"describe={path}", f"quiet={quiet}"])
+    assert f"{path}: patch 33 of poisson_4096 holds NaN or infinity" in message
+
+
+def test_meshes_with_open_edges_are_counted(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    dice = shapes.make("dice")
+    write_mesh(folder / "meshes/open.off", Mesh(dice.vertices, dice.faces[1:]))
+    prepare(folder, "data.patches=3")
+    output = capsys.readouterr()
+    assert "1 of 3: open (3)" in output.err
+    for _ in (0, 1):  # from the file that is there, too
+        (line,) = (line for line in output.out.splitlines() if line.startswith("meshes_with_open_edges"))
+        assert line.split(maxsplit=1)[1] == "1 of 3: open (3)"
+        prepare(folder, "data.patches=3")
+        output = capsys.readouterr()
+        assert not output.err
 
 
 def test_refusals(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

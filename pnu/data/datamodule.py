@@ -4,6 +4,7 @@ import functools
 import hashlib
 import json
 import os
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from torch.utils.data import DataLoader, Dataset, Subset
 from pnu.data import shapes
 from pnu.data.augment import from_options
 from pnu.data.dataset import Downsampling, EpochSampler, Options, PatchDataset, check_options, split
-from pnu.data.patchset import build, check
+from pnu.data.patchset import build, check, told_open
 from pnu.io import Mesh, meshes_of, read_mesh
 from pnu.runtime.progress import counted
 
@@ -157,7 +158,7 @@ class PatchDataModule(EpochDataModule):
         check_options(self.file, self.evaluation)
         contents = check(self.file)
         if contents.names is None:
-            print(f"{self.file} has no shape names: validation and test are its last blocks of consecutive patches")
+            say(f"{self.file} has no shape names: validation and test are its last blocks of consecutive patches")
         self.names = contents.names
         self.rows = split(contents.names, contents.patches, **self.shares, seed=0)
         self.check_batch_size(len(self.rows["train"]), str(self.file))
@@ -210,7 +211,21 @@ class GeneratedDataModule(PatchDataModule):
                 path, makers, self.patches, seed=self.shape_seed, parameters=parameters, processes=processes,
                 progress=None if self.quiet else functools.partial(counted, description=f"cut patches into {path}"),
             )  # fmt: skip
+            say_open(check(path).open_edges or {})
         return path
+
+
+def say(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
+def say_open(open_edges: Mapping[str, int]) -> None:
+    """A line on meshes with open edges, by the numbers of these; none where all are closed."""
+    if any(open_edges.values()):
+        say(
+            f"meshes with open edges (holes, or faces that turn the other way than their neighbors): "
+            f"{told_open(open_edges)}; where faces are turned, so are the normals that are learnt"
+        )
 
 
 class SyntheticDataModule(GeneratedDataModule):

@@ -1,5 +1,6 @@
 """Patch files: HDF5 with dense patches of meshes. Schema in data/README.md; PU-Net's own file has the same one."""
 
+import functools
 import json
 import multiprocessing
 import multiprocessing.connection
@@ -18,6 +19,7 @@ from scipy.spatial import cKDTree
 from pnu.data.shapes import unit
 from pnu.io import Mesh, atomic_path
 from pnu.ops.edges import sharp_edge_points
+from pnu.ops.mesh import open_edges
 from pnu.ops.sampling import farthest_points_large
 from pnu.ops.surface import sample_area
 
@@ -25,6 +27,8 @@ PATCH_POINTS = 4096
 EDGE_POINTS = 256
 SHARES = (0.3, 0.1)  # of its shape that a patch covers
 OVERSAMPLING = 5  # random points from which each of the evenly spread ones is chosen
+LEAST = 64  # different points of a patch
+CHECKED = 64  # patches that are checked at once
 DENSEST = 100  # bytes that a byte of the file may stand for; compressed coordinates stay far below, forged headers not
 
 
@@ -33,6 +37,7 @@ class Patches(NamedTuple):
 
     clouds: np.ndarray  # (p, 4096, 6) float32, points in the frame of the shape and unit normals
     edges: np.ndarray  # (p, 256, 3) float32, points on the sharp edges near the patch, NaN where there are fewer
+    open_edges: int  # of the mesh, see `ops.mesh.open_edges`
 
 
 def cut_patches(mesh: Mesh, count: int, rng: np.random.Generator) -> Patches:
@@ -49,7 +54,8 @@ def cut_patches(mesh: Mesh, count: int, rng: np.random.Generator) -> Patches:
         centers = dense[farthest_points_large(dense[:, :3], part), :3] if part else dense[:0, :3]
         clouds.append(dense[cKDTree(dense[:, :3]).query(centers, PATCH_POINTS)[1]])
     patches = np.concatenate(clouds)
-    return Patches(patches, np.stack([edges_of(patch, sharp, rng) for patch in patches]))
+    edges = np.stack([edges_of(patch, sharp, rng) for patch in patches])
+    return Patches(patches, edges, open_edges(mesh))
 
 
 def edges_of(patch: np.ndarray, sharp: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -98,21 +104,25 @@ def build(
             for _, made in progress(results, len(jobs)) if progress else results:
                 rows = slice(row, row + len(made.clouds))
                 file["poisson_4096"][rows], file["edges"][rows] = made.clouds, made.edges
+                file["open_edges"][rows] = made.open_edges
                 row = rows.stop
 
 
 def lay_out(path: Path, names: Sequence[str], parameters: Mapping[str, Any] | None) -> None:
     """A patch file that lacks only the numbers. Their space is taken first: on a full disk HDF5 crashes."""
-    reserve(path, len(names) * 4 * (6 * PATCH_POINTS + 3 * EDGE_POINTS) + 2**20)
+    reserve(path, len(names) * 4 * (6 * PATCH_POINTS + 3 * EDGE_POINTS + 1) + 2**20)
     whole = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     whole.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
     whole.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
     with h5py.File(path, "w") as file:
         file.attrs["parameters"] = json.dumps(dict(parameters or {}), sort_keys=True)
         file["name"] = np.array(names, h5py.string_dtype())
-        for name, shape in (("poisson_4096", (PATCH_POINTS, 6)), ("edges", (EDGE_POINTS, 3))):
-            space = h5py.h5s.create_simple((len(names), *shape))
-            h5py.h5d.create(file.id, name.encode(), h5py.h5t.IEEE_F32LE, space, whole)
+        for name, kind, shape in (
+            ("poisson_4096", h5py.h5t.IEEE_F32LE, (PATCH_POINTS, 6)),
+            ("edges", h5py.h5t.IEEE_F32LE, (EDGE_POINTS, 3)),
+            ("open_edges", h5py.h5t.STD_I32LE, ()),
+        ):
+            h5py.h5d.create(file.id, name.encode(), kind, h5py.h5s.create_simple((len(names), *shape)), whole)
     reserve(path, path.stat().st_size)
 
 
@@ -162,17 +172,25 @@ class Contents(NamedTuple):
     has_edges: bool
     has_input: bool  # montecarlo_1024
     parameters: dict[str, Any]
+    open_edges: dict[str, int] | None  # of the mesh of each shape; None where the file does not tell
 
 
 def check(path: str | Path) -> Contents:
-    """What a patch file holds.
+    """What a patch file holds; every patch of it is looked at, once in a process while the file stays as it is.
 
     Raises:
-        ValueError: no such file, no HDF5, or it lacks what training needs; the message says what.
+        ValueError: no such file, no HDF5, or it lacks what training needs; the message says what, and in which patch.
     """
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"{path}: no such file; expected an HDF5 file of patches as data/README.md describes")
+    found = path.stat()
+    return checked(path, found.st_ino, found.st_size, found.st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=16)
+def checked(path: Path, *_: int) -> Contents:
+    """`check` of a file that has not changed since: its number, size and time are arguments too."""
     with opened(path) as file:
         return contents_of(path, file)
 
@@ -195,15 +213,6 @@ def contents_of(path: Path, file: h5py.File) -> Contents:
         raise ValueError(f"{path}: poisson_4096 must have shape (patches, 64 or more points, 6), found {clouds.shape}")
     if clouds.dtype.kind != "f":
         raise ValueError(f"{path}: poisson_4096 must hold floating-point numbers, found {clouds.dtype}")
-    sample = clouds[:: -(-len(clouds) // 8)]
-    if not np.isfinite(sample).all():
-        raise ValueError(f"{path}: poisson_4096 holds NaN or infinity")
-    length = np.linalg.norm(sample[..., 3:], axis=-1)
-    if not (np.abs(length - 1) < 0.01).mean() > 0.99:
-        raise ValueError(
-            f"{path}: columns 4 to 6 of poisson_4096 must be unit normals, found lengths {length.min():.3g} to"
-            f" {length.max():.3g}"
-        )
     names = names_of(path, file, len(clouds))
     given = dataset(path, file, "montecarlo_1024")
     if given is not None and (given.ndim != 3 or given.shape[0] != len(clouds) or given.shape[2] != 6):
@@ -211,7 +220,83 @@ def contents_of(path: Path, file: h5py.File) -> Contents:
     edges = dataset(path, file, "edges")
     if edges is not None and (edges.ndim != 3 or edges.shape[0] != len(clouds) or edges.shape[2] != 3):
         raise ValueError(f"{path}: edges must have shape ({len(clouds)}, points, 3), found {edges.shape}")
-    return Contents(clouds.shape[0], clouds.shape[1], names, edges is not None, given is not None, parameters_of(file))
+    check_clouds(path, "poisson_4096", clouds)
+    if given is not None:
+        check_clouds(path, "montecarlo_1024", given)
+    if edges is not None:
+        check_edges(path, edges)
+    return Contents(
+        clouds.shape[0], clouds.shape[1], names, edges is not None, given is not None, parameters_of(file),
+        open_edges_of(path, file, names),
+    )  # fmt: skip
+
+
+def check_clouds(path: Path, name: str, clouds: h5py.Dataset) -> None:
+    """ValueError with the first patch that cannot be trained on, of clouds (N, n, 6): NaN or infinity, fewer than 64
+    different points, or less than 99 % of unit normals."""
+    faults: dict[str, list[int]] = {"values": [], "points": [], "normals": []}
+    told: dict[str, str] = {}
+    for start in range(0, len(clouds), CHECKED):
+        with np.errstate(over="ignore", invalid="ignore"):
+            part = np.asarray(clouds[start : start + CHECKED], np.float32)  # as training reads them
+            length = np.sqrt(np.einsum("pnc,pnc->pn", part[..., 3:], part[..., 3:]))
+            number = different(part[..., :3])
+        good = {
+            "values": np.isfinite(part).all((1, 2)),
+            "points": number >= min(LEAST, clouds.shape[1]),
+            "normals": (np.abs(length - 1) < 0.01).mean(1) > 0.99,
+        }
+        for fault, kept in good.items():
+            bad = np.flatnonzero(~kept)
+            faults[fault] += (bad + start).tolist()
+            if len(bad) and fault not in told:
+                row = bad[0]
+                told[fault] = {
+                    "values": "holds NaN or infinity",
+                    "points": f"has {number[row]} different points, {LEAST} or more are needed",
+                    "normals": f"has no unit normals in columns 4 to 6, found lengths {length[row].min():.3g} to"
+                    f" {length[row].max():.3g}",
+                }[fault]
+    for fault, rows in faults.items():
+        if rows:
+            more = f" (and {len(rows) - 1} more patches)" if len(rows) > 1 else ""
+            raise ValueError(f"{path}: patch {rows[0]} of {name} {told[fault]}{more}; mend or remove it")
+
+
+def different(points: np.ndarray) -> np.ndarray:
+    """How many different points each cloud of (p, n, 3) float32 has, (p,)."""
+    bits = (points + np.float32(0)).view(np.uint32).astype(np.uint64)  # -0 becomes 0
+    keys = bits @ np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+    return 1 + (np.diff(np.sort(keys, axis=1), axis=1) != 0).sum(1)
+
+
+def check_edges(path: Path, edges: h5py.Dataset) -> None:
+    """ValueError with the first patch whose rows of edges are neither points nor empty."""
+    for start in range(0, len(edges), CHECKED):
+        part = np.asarray(edges[start : start + CHECKED], float)
+        bad = ~(np.isfinite(part).all(2) | np.isnan(part).all(2)).all(1)
+        if bad.any():
+            raise ValueError(
+                f"{path}: patch {start + int(bad.argmax())} of edges holds infinity, or NaN in a part of a row; a row"
+                " is a point, or NaN in all three columns"
+            )
+
+
+def open_edges_of(path: Path, file: h5py.File, names: list[str] | None) -> dict[str, int] | None:
+    """Open edges of the mesh of each shape, where the file tells them."""
+    counts = dataset(path, file, "open_edges")
+    if counts is None or names is None or counts.shape != (len(names),) or counts.dtype.kind not in "iu":
+        return None
+    return dict(zip(names, counts[()].tolist(), strict=True))
+
+
+def told_open(open_edges: Mapping[str, int]) -> str:
+    """How many meshes have open edges, and which, from the numbers of their edges by name."""
+    found = {name: number for name, number in open_edges.items() if number}
+    if not found:
+        return f"0 of {len(open_edges)}"
+    listed = ", ".join(f"{name} ({number})" for name, number in list(found.items())[:5])
+    return f"{len(found)} of {len(open_edges)}: {listed}" + (", ..." if len(found) > 5 else "")
 
 
 def dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset | None:
@@ -287,5 +372,6 @@ def describe(path: str | Path) -> dict[str, Any]:
         "coordinates_to": float(points.max()),
         "normals_of_length_1": float((np.abs(np.linalg.norm(normals, axis=-1) - 1) < 1e-3).mean()),
         "share_with_sharp_edges": sharp,
+        "meshes_with_open_edges": None if contents.open_edges is None else told_open(contents.open_edges),
         "parameters": contents.parameters,
     }

@@ -4,9 +4,10 @@ from typing import Any
 
 from pnu.data import shapes
 from pnu.data.crops import SMALLEST, Crops, WholeClouds, flattened, stacked
-from pnu.data.datamodule import EpochDataModule
+from pnu.data.datamodule import EpochDataModule, say_open
 from pnu.data.truth import Truth
 from pnu.io import meshes_of, read_mesh
+from pnu.ops.mesh import open_edges
 
 
 class ProjectionDataModule(EpochDataModule):
@@ -46,6 +47,8 @@ class ProjectionDataModule(EpochDataModule):
             return
         files = meshes_of(self.root) if self.root else {}
         meshes = {name: shapes.unit(read_mesh(path)) for name, path in files.items()}
+        if self.process[0] == 0:
+            say_open({name: open_edges(mesh) for name, mesh in meshes.items()})
         if self.procedural:
             meshes |= {name: shapes.make(name) for name in shapes.names()}
         missing = [name for name in self.held_out if name not in meshes]
