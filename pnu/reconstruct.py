@@ -16,7 +16,9 @@ class Reconstruct:
     """Make a triangle mesh from a point cloud file, and measure it against the true surface where there is one."""
 
     commas: ClassVar = ("columns",)
-    input: str = doc("cloud to read: ply, xyz, txt, pcd, obj, off, npy, las, laz, stl, glb, gltf, vtk, vtp or e57")
+    input: str = doc(
+        "cloud to read: ply, text (xyz, csv, pts ...), pcd, las, laz, e57, npy, npz; of a mesh its vertices"
+    )
     output: str = doc("mesh to write: ply (keeps colours and errors), obj, off or stl")
     normals: str = doc("auto: the file's, estimated where it has none; estimate: always estimated")
     columns: str | None = doc(

@@ -27,7 +27,9 @@ class Upsample:
 
     also: ClassVar = {"model": "run"}
     commas: ClassVar = ("columns",)
-    input: str = doc("file to read: ply, xyz, txt, pcd, obj, off, npy, las, laz, stl, glb, gltf, vtk, vtp or e57")
+    input: str = doc(
+        "file to read: ply, text (xyz, csv, pts ...), pcd, las, laz, e57, npy, npz; of a mesh its vertices"
+    )
     output: str = doc("file to write; its suffix says the format")
     run: str = doc("run folder, or weights that come with pnu: surface, pnu ...; newest: the run that finished last")
     ratio: float = doc("points out for each point in, any number >= 1")

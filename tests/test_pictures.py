@@ -241,6 +241,29 @@ def test_different_objects_are_each_seen_whole(tmp_path: Path, capsys: pytest.Ca
     assert not in_one_place(small, small + 3)
 
 
+def test_columns_of_text_or_panels_in_a_row(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cloud = sphere(300)
+    np.savetxt(tmp_path / "c.txt", np.hstack([cloud[:, 3:], cloud[:, :3]]))
+
+    def draw(columns: str) -> str:
+        given = f"inputs=[{tmp_path}/c.txt,{tmp_path}/c.txt]"
+        picture([given, f"output={tmp_path}/a.png", "size=60", f"columns={columns}"])
+        return capsys.readouterr().out
+
+    assert "(cloud, color=normal)" in draw("nx,ny,nz,x,y,z")
+    assert "(cloud, color=plain)" in draw("_,_,_,x,y,z")
+    draw("1")
+    one = np.asarray(Image.open(tmp_path / "a.png")).shape
+    draw("2")
+    two = np.asarray(Image.open(tmp_path / "a.png")).shape
+    assert one[0] > two[0]
+    assert one[1] < two[1]
+    for wrong, message in {"0": "a number above 0, or names", "x,y": "expected x, y and z among the names"}.items():
+        with pytest.raises(SystemExit):
+            draw(wrong)
+        assert message in capsys.readouterr().err
+
+
 def test_crop_keeps_all_ink() -> None:
     panel = np.full((50, 50, 3), 255, np.uint8)
     panel[20:30, 10:40] = 0
