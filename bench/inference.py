@@ -16,8 +16,8 @@ from bench.scale import wavy_sphere
 from bench.timing import Row, compare
 from pnu.inference import upsample
 from pnu.io import write_cloud, write_json
-from pnu.models.pnu import PNU
-from pnu.models.released import from_released
+from pnu.networks.pnu import PNU
+from pnu.networks.released import from_released
 
 POINTS, RATIO, PATCH = 5000, 4, 1024
 SHARED = 10_000  # points of a cloud that processes share
@@ -55,7 +55,7 @@ def as_run(network: torch.nn.Module, folder: Path) -> Path:
     (folder / "checkpoints").mkdir(parents=True)
     state = {f"model.{name}": value for name, value in network.state_dict().items()}
     torch.save({"state_dict": state}, folder / "checkpoints" / "best.ckpt")
-    (folder / "config.yaml").write_text("model: {_target_: pnu.models.pnu.PNU}\n")
+    (folder / "config.yaml").write_text("model: {_target_: pnu.networks.pnu.PNU}\n")
     write_json(folder / "run.json", {"status": "finished"})
     return folder
 

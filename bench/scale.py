@@ -14,7 +14,7 @@ import torch
 from torch import nn
 
 from pnu import weights
-from pnu.models.pnu import PNU
+from pnu.networks.pnu import PNU
 
 SHORT = [10_000, 30_000, 100_000]
 RUN = """

@@ -21,24 +21,26 @@ from torch.profiler import ProfilerActivity
 from torch.profiler import profile as torch_profile
 from torch.utils.flop_counter import FlopCounterMode
 
+import pnu.fast.forms
 import pnu.losses.compound
-import pnu.models.layers
+import pnu.networks.pnu
 from bench.plain import PlainLoss, PlainPNU
 from bench.timing import Row, compare
 from pnu.data import shapes
 from pnu.data.datamodule import PatchDataModule
+from pnu.fast import accelerate
 from pnu.losses import CompoundLoss
-from pnu.models.pnu import PNU
-from pnu.models.released import from_released
+from pnu.networks.pnu import PNU
+from pnu.networks.released import from_released
 from pnu.ops import patches, surface
 from pnu.ops.normalize import unit_sphere_frame
 
 CLOUDS, POINTS, RATIO = 20, 1024, 4
 SIZE = f"{CLOUDS} x {POINTS} -> {POINTS * RATIO}"
 SEARCHES = {
-    "farthest points": (pnu.models.layers, "farthest_points"),
-    "balls": (pnu.models.layers, "ball_query"),
-    "3 nearest of the network": (pnu.models.layers, "knn"),
+    "farthest points": (pnu.networks.pnu, "farthest_points"),
+    "balls": (pnu.fast.forms, "ball_query"),
+    "3 nearest of the network": (pnu.fast.forms, "knn"),
     "k nearest of the loss": (pnu.losses.compound, "knn"),
     "nearest of the loss": (pnu.losses.compound, "nearest"),
 }
@@ -85,7 +87,7 @@ def trainings() -> tuple[Callable[[], Tensor], Callable[[], Tensor]]:
     def of(network: nn.Module, loss: nn.Module) -> Callable[[], Tensor]:
         return partial(step, network, loss, torch.optim.Adam(network.parameters(), 1e-3, weight_decay=1e-5))
 
-    return of(ours, CompoundLoss()), of(plain, PlainLoss())
+    return of(accelerate(ours), accelerate(CompoundLoss())), of(plain, PlainLoss())
 
 
 def loss_of(loss: nn.Module, prediction: Tensor) -> None:
@@ -123,7 +125,7 @@ def loss_rows(rounds: int = 3) -> list[Row]:
     _, target = data()
     noise = torch.randn(target.shape, generator=torch.Generator().manual_seed(0))
     prediction = (target + 0.01 * noise).requires_grad_()
-    losses = {"pnu": CompoundLoss(), "plain torch: full matrices": PlainLoss()}
+    losses = {"pnu": accelerate(CompoundLoss()), "plain torch: full matrices": PlainLoss()}
     runs = {name: partial(loss_of, loss, prediction) for name, loss in losses.items()}
     return [compare(f"compound loss and gradient, {CLOUDS} x {POINTS * RATIO}", runs, rounds=rounds)]
 

@@ -1,6 +1,6 @@
 """Run folders: find one, and read the network that it holds.
 
-    outputs/<date>/<time>_<name>/config.yaml             resolved config; its group `model` is what `models.build` takes
+    outputs/<date>/<time>_<name>/config.yaml             resolved config; its group `model` is for `networks.build`
                                  checkpoints/best.ckpt   and last.ckpt: "state_dict" with the network under "model."
                                  run.json                status, versions, git revision, wall time ...
 
@@ -23,7 +23,7 @@ import torch
 import yaml
 from torch import Tensor, nn
 
-from pnu import models, weights
+from pnu import networks, weights
 from pnu.io import atomic_path, write_json
 
 PREFIX = "model."
@@ -78,7 +78,7 @@ def resolve(source: str | PathLike[str]) -> str | PathLike[str]:
 def _unfilled(config: Mapping[str, Any]) -> nn.Module:
     """The network of a config, to be filled, in float32; what it draws at first leaves no trace in the generator."""
     with torch.device("cpu"), torch.random.fork_rng(devices=[]):
-        return models.build(config).float()
+        return networks.build(config).float()
 
 
 def run_config(folder: Path) -> dict[str, Any]:

@@ -26,8 +26,8 @@ def convert(cfg: Any) -> None:
         raise ValueError(f"output={output}: the folder {output.parent} does not exist; create it first")
 
     from pnu import checkpoint
-    from pnu.models.pnu import PNU
-    from pnu.models.released import from_released
+    from pnu.networks.pnu import PNU
+    from pnu.networks.released import from_released
 
     content = checkpoint.read(cfg.input)
     state = content.get("model_state_dict")
@@ -41,7 +41,7 @@ def convert(cfg: Any) -> None:
         raise ValueError(f"{cfg.input}: is not of the released network: {reason}") from None
     epoch = content.get("epoch")
     record = {"source": Path(cfg.input).name, "epoch": epoch, "training_loss": content.get("loss")}
-    checkpoint.save(output, network, {"_target_": "pnu.models.pnu.PNU", "ratio": 4}, record)
+    checkpoint.save(output, network, {"_target_": "pnu.networks.pnu.PNU", "ratio": 4}, record)
     if not cfg.quiet:
         print(f"input:  {cfg.input}, epoch {epoch}")
         print(f"run:    {output}")

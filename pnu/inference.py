@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from pnu import __version__, checkpoint
+from pnu.fast import accelerated
 from pnu.io import Cloud, check_cloud
 from pnu.ops.attributes import carry
 from pnu.ops.normalize import Frame, unit_sphere_frame
@@ -95,7 +96,7 @@ def upsample(
     sparse, frame = _prepare(given, progress)
     finished = Parts() if parts is None else Parts(Path(parts) / _digest(network, sparse, count, upsampler))
     context = Context(target, batch_size, torch.Generator().manual_seed(seed), progress, finished)
-    with torch.no_grad(), evaluating(network), ExitStack() as stack:
+    with torch.no_grad(), evaluating(network), accelerated(modules_of(network)), ExitStack() as stack:
         if torch.get_default_device().type != "cpu":
             stack.enter_context(torch.device("cpu"))
         if devices > 1:

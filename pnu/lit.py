@@ -17,8 +17,9 @@ from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 
 from pnu.checkpoint import write
+from pnu.fast import accelerate
 from pnu.metrics import METRICS, CloudMetrics, Metric
-from pnu.models.norm import synchronize
+from pnu.networks.norm import synchronize
 from pnu.upsamplers import dense_patches
 
 Batch = Mapping[str, Any]
@@ -122,8 +123,8 @@ class UpsamplingModule(pl.LightningModule):
         metrics: Sequence[Metric] = METRICS,
     ) -> None:
         super().__init__()
-        self.model = model
-        self.loss = loss
+        self.model = accelerate(model)
+        self.loss = None if loss is None else accelerate(loss)
         self.optimizer, self.scheduler = optimizer, scheduler
         normals = bool(getattr(model, "predicts_normals", True))
         self.val_metrics, self.test_metrics = CloudMetrics(normals, metrics), CloudMetrics(normals, metrics)

@@ -44,7 +44,7 @@ def train(cfg: Any) -> list[float] | None:
         import lightning.pytorch as pl  # seconds: only once the config is known to be good
         import torch
 
-        from pnu import callbacks, checkpoint, lit, metrics, models
+        from pnu import callbacks, checkpoint, lit, metrics, networks
 
         lit.quieten()
         lit.keep_threads()
@@ -52,7 +52,7 @@ def train(cfg: Any) -> list[float] | None:
             torch.set_num_threads(config["threads"])
         pl.seed_everything(config["seed"], verbose=False)
         data = build(config["data"], "pnu.data")
-        model = models.build(config["model"])
+        model = networks.build(config["model"])
         if source := config.get("weights"):
             checkpoint.fill(model, checkpoint.load(source).state_dict(), source)
         loss = build(config["loss"], "pnu.losses")

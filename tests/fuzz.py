@@ -217,13 +217,13 @@ def patch_files() -> list[bytes]:
     return made
 
 
-MODEL = {"_target_": "pnu.models.pnu.PNU", "ratio": 2, "local_features": False}
+MODEL = {"_target_": "pnu.networks.pnu.PNU", "ratio": 2, "local_features": False}
 
 
 def checkpoint_files() -> list[bytes]:
     import torch
 
-    from pnu.models import build
+    from pnu.networks import build
 
     state = {f"model.{name}": value for name, value in build(MODEL).state_dict().items()}
     made = []
@@ -236,7 +236,7 @@ def checkpoint_files() -> list[bytes]:
 
 def weight_files() -> list[bytes]:
     from pnu import weights
-    from pnu.models import build
+    from pnu.networks import build
 
     state = build(MODEL).state_dict()
     return [written(".safetensors", lambda path: weights.write(path, MODEL, state))]
@@ -611,7 +611,8 @@ def safetensors_files(draw: st.DrawFn) -> bytes:
 def yaml_files(draw: st.DrawFn) -> bytes:
     leaf = st.sampled_from([None, True, -1, 0, 3, 2.5, float("nan"), "x", "pnu", [], {}, [1, 2], "${oc.env:HOME}"])
     key = st.sampled_from(["ratio", "local_features", "global_features", "predict_normals", "input_normals", "other"])
-    target = st.sampled_from(["pnu.models.pnu.PNU", "pnu.models.pnu_paper.PNUPaper", "os.system", "pnu.io.os", "", 3])
+    networks = ["pnu.networks.pnu.PNU", "pnu.networks.pnu_paper.PNUPaper"]
+    target = st.sampled_from([*networks, "os.system", "pnu.io.os", "", 3])
     model = st.fixed_dictionaries({"_target_": target}) | st.dictionaries(key, leaf, max_size=4)
     model |= st.builds(lambda a, b: a | b, st.fixed_dictionaries({"_target_": target}), st.dictionaries(key, leaf))
     content = json.dumps({"model": draw(model | leaf), "data": draw(leaf | st.just({"input_points": draw(leaf)}))})
@@ -667,7 +668,7 @@ def child(names: list[str], cases: int, start: int, folder: Path) -> None:
     import torch
 
     from pnu import checkpoint
-    from pnu.models import build
+    from pnu.networks import build
 
     torch.set_num_threads(1)
     if any(READERS[name].read in (read_checkpoint, read_weights, read_config) for name in names):

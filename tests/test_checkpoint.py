@@ -12,9 +12,9 @@ import yaml
 import pnu
 from pnu import checkpoint
 from pnu.io import read_json, write_json
-from pnu.models.pnu import PNU
+from pnu.networks.pnu import PNU
 
-MODEL = {"_target_": "pnu.models.pnu.PNU", "ratio": 2, "local_features": False}
+MODEL = {"_target_": "pnu.networks.pnu.PNU", "ratio": 2, "local_features": False}
 
 
 def network(seed: int = 0) -> PNU:
@@ -58,7 +58,7 @@ def test_code_is_not_run(run: Path) -> None:
         pnu.load(run)
     config = yaml.safe_dump({"model": {"_target_": "os.mkdir", "path": str(run / "evil")}})
     (run / "config.yaml").write_text(config)
-    with pytest.raises(ValueError, match=r"model._target_: expected a class below pnu.models.* got 'os.mkdir'"):
+    with pytest.raises(ValueError, match=r"model._target_: expected a class below pnu.networks.* got 'os.mkdir'"):
         pnu.load(run)
     (run / "config.yaml").write_text(f"model: !!python/object/apply:os.mkdir ['{run / 'evil'}']")
     with pytest.raises(ValueError, match=r"config.yaml: is not YAML \(could not determine a constructor"):

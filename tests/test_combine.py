@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pnu.ops.combine import combine
+from pnu.fast.combine import combine
 
 
 @pytest.mark.parametrize(("q", "k"), [(50, 1), (50, 3), (1, 4)])

@@ -16,13 +16,13 @@ from pnu.comparison.shapes import error_limit, points_for, rebuild, view
 from pnu.comparison.tables import tables
 from pnu.evaluation import Case, Truth
 from pnu.io import read_json, write_json, write_mesh
-from pnu.models.pnu import PNU
+from pnu.networks.pnu import PNU
 from pnu.ops.surface import sample_poisson_disk
 from tests.test_page import CHROMIUM, browse
 from tests.test_surfaces import icosphere
 
 SMALL = ["points=300", "truth_points=1200", "ratio=2", "size=100", "quiet=true"]
-NETWORK = {"_target_": "pnu.models.pnu.PNU", "ratio": 2, "local_features": False}
+NETWORK = {"_target_": "pnu.networks.pnu.PNU", "ratio": 2, "local_features": False}
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from pnu.data.truth import Truth
 from pnu.io import Mesh, write_mesh
 from pnu.lit import TRAINER_OPTIONS, quieten
 from pnu.losses.surface import SurfaceLoss
-from pnu.models.surface import Surface
+from pnu.networks.surface import Surface
 from pnu.ops.surface import closest_points, face_normals, sample_area
 
 NAMES = sorted(shapes.names())[:2] + sorted(shapes.names("cad"))[-1:]

@@ -13,10 +13,10 @@ import torch
 
 from pnu import checkpoint
 from pnu.checkpoint import read
-from pnu.models import build
+from pnu.networks import build
 from tests.test_cli import small  # noqa: F401  a fixture
 
-PNU = {"_target_": "pnu.models.pnu.PNU", "ratio": 2, "local_features": False}
+PNU = {"_target_": "pnu.networks.pnu.PNU", "ratio": 2, "local_features": False}
 WRITERS = """
 import functools, sys, torch
 from pathlib import Path

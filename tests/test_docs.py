@@ -17,8 +17,8 @@ from PIL import Image
 from pnu.data import shapes
 from pnu.doctor import open3d_error
 from pnu.io import read_cloud, read_mesh, write_cloud, write_mesh
-from pnu.models.pnu import PNU
-from pnu.models.released import rename
+from pnu.networks.pnu import PNU
+from pnu.networks.released import rename
 from pnu.ops.surface import sample_area
 from pnu.run.config import compose_config
 from pnu.train import Train

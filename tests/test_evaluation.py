@@ -19,7 +19,7 @@ from pnu.data import shapes
 from pnu.evaluate import main
 from pnu.evaluation import cases, cost, report
 from pnu.io import Mesh, read_cloud, read_json, write_cloud, write_json, write_mesh
-from pnu.models.pnu import PNU
+from pnu.networks.pnu import PNU
 from pnu.ops.surface import closest_points, sample_area, sample_poisson_disk
 from pnu.upsamplers import classical
 
@@ -374,7 +374,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     torch.manual_seed(0)
     state = {f"model.{name}": value for name, value in PNU(ratio=2, local_features=False).state_dict().items()}
     torch.save({"state_dict": state}, run / "checkpoints" / "best.ckpt")
-    model = {"_target_": "pnu.models.pnu.PNU", "ratio": 2, "local_features": False}
+    model = {"_target_": "pnu.networks.pnu.PNU", "ratio": 2, "local_features": False}
     (run / "config.yaml").write_text(yaml.safe_dump({"model": model}))
     write_json(run / "run.json", {"status": "finished"})
     return tmp_path

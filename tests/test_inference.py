@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from pnu.inference import normals, upsample
-from pnu.models.pnu import PNU
+from pnu.networks.pnu import PNU
 from pnu.upsamplers import Context, Patches
 
 Array = np.ndarray

@@ -1,7 +1,9 @@
 """Loss terms: the released values, hand-computed clouds, SciPy, gradients, options."""
 
+import copy
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -11,8 +13,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from torch import Tensor
 
+from pnu.fast import accelerate, terms
 from pnu.losses import compound as losses
-from pnu.losses import neighborhood
 from pnu.losses.compound import CompoundLoss, Matches, search
 from pnu.ops.grouping import gather
 from pnu.ops.transport import assign
@@ -133,26 +135,31 @@ def test_gradients(term: Callable[[Tensor, Tensor, Matches], Tensor]) -> None:
 
 
 @pytest.mark.parametrize("absolute", [True, False])
-def test_neighborhood_terms_at_once(monkeypatch: pytest.MonkeyPatch, absolute: bool) -> None:
-    """Values and gradients of the three terms in one pass equal those one by one, also of degenerate points."""
-    monkeypatch.setattr(neighborhood, "PIECE", 20)
+@pytest.mark.parametrize("reduction", ["mean", "sum"])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-9), (torch.float32, 1e-4)])
+def test_fast_loss_equals_the_plain_one(
+    monkeypatch: pytest.MonkeyPatch,
+    absolute: bool,
+    reduction: Literal["mean", "sum"],
+    dtype: torch.dtype,
+    tolerance: float,
+) -> None:
+    """Values and gradients of the three neighbourhood terms in one pass, also of degenerate points."""
+    monkeypatch.setattr(terms, "PIECE", 20)
     prediction, _ = clouds(3, 50, 1)
     prediction[0, 1, :3] = prediction[0, 0, :3]
     prediction[1, 2, 3:] = 0
-    prediction.requires_grad_()
+    prediction = prediction.to(dtype).requires_grad_()
     idx = search(prediction, prediction, 6).neighbors
-    near = gather(prediction, idx)
-    expected = [
-        losses.point_knn(prediction, near, "sum"),
-        losses.normal_orth(prediction, near, "sum", absolute),
-        losses.normal_knn(prediction, near, "sum"),
-    ]
-    found = neighborhood.sums(prediction, idx, absolute, losses.TINY) / 3
-    torch.testing.assert_close(found, torch.stack(expected))
-    for a, b in zip(found, expected, strict=True):
-        (of_a,) = torch.autograd.grad(a, prediction, retain_graph=True)
-        (of_b,) = torch.autograd.grad(b, prediction, retain_graph=True)
-        torch.testing.assert_close(of_a, of_b)
+    loss = CompoundLoss(reduction=reduction, orth="absolute" if absolute else "signed")
+    expected = loss.neighborhood_terms(prediction, idx)
+    found = accelerate(copy.deepcopy(loss)).neighborhood_terms(prediction, idx)
+    assert list(found) == list(expected) == ["point_knn", "normal_orth", "normal_knn"]
+    for name, value in expected.items():
+        torch.testing.assert_close(found[name], value, rtol=tolerance, atol=tolerance)
+        (of_found,) = torch.autograd.grad(found[name], prediction, retain_graph=True)
+        (of_expected,) = torch.autograd.grad(value, prediction, retain_graph=True)
+        torch.testing.assert_close(of_found, of_expected, rtol=tolerance, atol=tolerance)
 
 
 def test_gradient_of_the_whole_loss() -> None:

@@ -11,10 +11,11 @@ import torch
 from reference import ball_query
 from torch import Tensor, nn
 
-from pnu.models import build, layers
-from pnu.models.pnu import PNU
-from pnu.models.pnu_paper import RADII, PNUPaper
-from pnu.models.released import from_released
+from pnu.fast import accelerate
+from pnu.networks import build
+from pnu.networks.pnu import PNU, levels
+from pnu.networks.pnu_paper import RADII, PNUPaper
+from pnu.networks.released import from_released
 
 
 @pytest.fixture(scope="session")
@@ -43,13 +44,15 @@ def test_released_reference(shared: Path) -> None:
     network = PNU().eval()
     network.load_state_dict(from_released(state))
     expected = torch.from_numpy(reference["output"])
+    patch = torch.from_numpy(reference["input"])
+    torch.testing.assert_close(network(patch), expected, rtol=0, atol=1e-6)
     with torch.no_grad():  # layers in chunks, batch norm folded
-        torch.testing.assert_close(network(torch.from_numpy(reference["input"])), expected, rtol=0, atol=1e-6)
-    plainly = network(torch.from_numpy(reference["input"]))  # layers one by one
-    torch.testing.assert_close(plainly, expected, rtol=0, atol=1e-6)
+        torch.testing.assert_close(accelerate(network)(patch), expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(network(patch), expected, rtol=0, atol=1e-6)  # layers one by one
 
 
-def test_training_equals_plain_port(plain: ModuleType) -> None:
+@pytest.mark.parametrize("fast", [False, True])
+def test_training_equals_plain_port(plain: ModuleType, fast: bool) -> None:
     """Output, gradient of every parameter and running statistics of one step, in float64."""
     torch.manual_seed(0)
     peer = plain.PlainPNU().double()
@@ -57,7 +60,7 @@ def test_training_equals_plain_port(plain: ModuleType) -> None:
         if isinstance(module, nn.modules.batchnorm._BatchNorm):
             nn.init.normal_(module.weight, 0.5)  # some negative: the maximum becomes a minimum
             nn.init.normal_(module.bias, std=0.2)
-    network = PNU().double()
+    network = accelerate(PNU().double()) if fast else PNU().double()
     network.load_state_dict(from_released(peer.state_dict()))
     patch = patches(3, 160).double()
     expected, output = peer(patch), network(patch)
@@ -98,7 +101,7 @@ def test_paper_features_are_maxima_over_radii() -> None:
 @pytest.mark.parametrize("ratio", [2, 4, 8, 16])
 @pytest.mark.parametrize("n", [64, 101])
 def test_shapes(name: str, ratio: int, n: int) -> None:
-    network = build({"_target_": f"pnu.models.{name}", "ratio": ratio})
+    network = build({"_target_": f"pnu.networks.{name}", "ratio": ratio})
     assert network.ratio == ratio
     output = network(patches(2, n))
     assert output.shape == (2, n * ratio, 6)
@@ -122,7 +125,7 @@ def test_switches(network: type[PNU]) -> None:
     local, both = network(global_features=False), network()
     assert local(patch).shape == (2, 256, 6)
     assert not any(name.startswith("global") for name, _ in local.named_parameters())
-    assert both.head.layers[0].linear.in_features == local.head.layers[0].linear.in_features + 512
+    assert both.head[0].linear.in_features == local.head[0].linear.in_features + 512
     assert set(both.outputs(patch)) == {"prediction"}
 
 
@@ -151,7 +154,7 @@ def test_steps_are_repeatable() -> None:
 
     def gradients() -> list[Tensor]:
         torch.manual_seed(0)
-        network = PNU()
+        network = accelerate(PNU())
         network(patches(3, 128)).square().mean().backward()
         return [parameter.grad for parameter in network.parameters() if parameter.grad is not None]
 
@@ -166,9 +169,10 @@ def test_steps_are_repeatable() -> None:
         torch.set_num_threads(threads)
 
 
-def test_mixed_precision() -> None:
+@pytest.mark.parametrize("fast", [False, True])
+def test_mixed_precision(fast: bool) -> None:
     torch.manual_seed(0)
-    network, patch = PNU(), patches(2, 64)
+    network, patch = accelerate(PNU()) if fast else PNU(), patches(2, 64)
     with torch.autocast("cpu", torch.bfloat16):
         output = network(patch)
     output.float().square().sum().backward()
@@ -192,11 +196,11 @@ def test_bad_input() -> None:
 @pytest.mark.parametrize(
     ("target", "text"),
     [
-        ("os.system", "expected a class below pnu.models, such as pnu.models.pnu.PNU, got 'os.system'"),
-        ("pnu.models.nothing.PNU", "'pnu.models.nothing.PNU' is no network of this version"),
-        ("pnu.models.pnu.PNUU", "'pnu.models.pnu.PNUU' is no network"),
-        ("pnu.models.pnu.torch", "is no network"),
-        ("pnu.models.layers.nn.Linear", "is no network"),
+        ("os.system", "expected a class below pnu.networks, such as pnu.networks.pnu.PNU, got 'os.system'"),
+        ("pnu.networks.nothing.PNU", "'pnu.networks.nothing.PNU' is no network of this version"),
+        ("pnu.networks.pnu.PNUU", "'pnu.networks.pnu.PNUU' is no network"),
+        ("pnu.networks.pnu.torch", "is no network"),
+        ("pnu.networks.layers.nn.Linear", "is no network"),
         ("", "got ''"),
     ],
 )
@@ -205,10 +209,17 @@ def test_build_only_networks(target: str, text: str) -> None:
         build({"_target_": target})
 
 
+def test_older_targets_are_built() -> None:
+    """Run folders and weights from before `pnu.networks` had its name say `pnu.models`."""
+    assert type(build({"_target_": "pnu.models.pnu.PNU", "ratio": 2})) is PNU
+    with pytest.raises(ValueError, match="'pnu.networks.layers.torch' is no network"):
+        build({"_target_": "pnu.models.layers.torch"})
+
+
 def test_build_arguments() -> None:
     with pytest.raises(ValueError, match="PNU does not accept these arguments: .*'depth'"):
-        build({"_target_": "pnu.models.pnu.PNU", "depth": 3})
-    assert isinstance(build({"_target_": "pnu.models.pnu_paper.PNUPaper", "ratio": 2}), PNUPaper)
+        build({"_target_": "pnu.networks.pnu.PNU", "depth": 3})
+    assert isinstance(build({"_target_": "pnu.networks.pnu_paper.PNUPaper", "ratio": 2}), PNUPaper)
 
 
 def test_released_names() -> None:
@@ -220,11 +231,11 @@ def test_released_names() -> None:
     assert from_released({"module.UPSAMPLING_module.7.bias": value})["head.2.norm.bias"].tolist() == [0, 2, 1, 3]
 
 
-def test_hierarchy_is_nested() -> None:
-    points = patches(2, 256)[..., :3]
-    levels = layers.hierarchy(points, (0.1, 0.2, 0.3, 0.4), 32)
-    assert [level.points.shape[1] for level in levels] == [256, 64, 16, 4]
-    for finer, level in itertools.pairwise(levels):
-        assert torch.equal(finer.points[:, : level.points.shape[1]], level.points)
-        offsets = layers.gather(finer.points, level.neighbors) - level.points[:, :, None]
-        assert offsets.norm(dim=-1).max() < 0.4
+def test_levels_are_nested() -> None:
+    points = patches(2, 256)[..., :3] + 1  # none near the origin, where none are taken
+    first, *others = levels(points, 4)
+    assert torch.equal(first, points)
+    assert [level.shape[1] for level in others] == [256, 64, 16, 4]
+    assert torch.equal(others[0].sort(1).values, points.sort(1).values)
+    for finer, level in itertools.pairwise(others):
+        assert torch.equal(finer[:, : level.shape[1]], level)

@@ -8,8 +8,8 @@ import torch
 
 from pnu.checkpoint import load
 from pnu.inference import upsample
-from pnu.models.pnu import PNU
-from pnu.models.surface import Surface
+from pnu.networks.pnu import PNU
+from pnu.networks.surface import Surface
 from pnu.runtime.parts import Parts
 from pnu.upsamplers import patches as procedure
 from pnu.upsamplers import surface

@@ -7,7 +7,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pnu.models.surface import Projector, Surface
+from pnu.networks.surface import Projector, Surface
 from pnu.ops.frames import feet, local_frames, tangent_basis
 from pnu.ops.spacing import spacing
 from pnu.ops.spread import repel, tangent_discs

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from pnu import models
+from pnu import networks
 from pnu.losses import EdgeAwareLoss, ParameterizationLoss, RepulsionLoss
 from pnu.losses.rivals import surface_distance_sq, unsigned_sq
 
@@ -15,7 +15,7 @@ NETWORKS = {"punet.PUNet": 3, "ecnet.ECNet": 3, "pugeo.PUGeo": 6}
 
 def network(name: str, ratio: int = 4) -> nn.Module:
     torch.manual_seed(0)
-    return models.build({"_target_": f"pnu.models.{name}", "ratio": ratio})
+    return networks.build({"_target_": f"pnu.networks.{name}", "ratio": ratio})
 
 
 def patch(batch: int = 2, n: int = 128) -> Tensor:

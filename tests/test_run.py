@@ -91,7 +91,7 @@ def group_keys_of(path: Path) -> set[str]:
 
 def test_defaults_are_the_papers() -> None:
     cfg = compose_config(Train)
-    assert cfg.model._target_ == "pnu.models.pnu.PNU"
+    assert cfg.model._target_ == "pnu.networks.pnu.PNU"
     assert cfg.optimizer._target_ == "torch.optim.Adam"
     assert (cfg.optimizer.lr, cfg.optimizer.weight_decay) == (1e-3, 1e-5)
     assert (cfg.data.batch_size, cfg.trainer.max_epochs) == (20, 500)

@@ -16,10 +16,10 @@ import yaml
 import pnu.io
 from pnu import checkpoint, evaluate
 from pnu.data import patchset, shapes
-from pnu.models import build
+from pnu.networks import build
 from tests.commands import refused
 
-PNU = {"_target_": "pnu.models.pnu.PNU", "ratio": 2, "local_features": False}
+PNU = {"_target_": "pnu.networks.pnu.PNU", "ratio": 2, "local_features": False}
 Attack = Callable[[Path, Path], None]
 
 
@@ -68,9 +68,9 @@ ATTACKS = {
     "os.mkdir": target("os.mkdir"),
     "builtins.exec": target("builtins.exec"),
     "subprocess.Popen": target("subprocess.Popen"),
-    "another package of that prefix": target("pnu.models_evil.Network"),
-    "what a module of ours imports": target("pnu.models.layers.torch.os.system"),
-    "a class that a module of ours imports": target("pnu.models.layers.nn.Module"),
+    "another package of that prefix": target("pnu.networks_evil.Network"),
+    "what a module of ours imports": target("pnu.networks.layers.torch.os.system"),
+    "a class that a module of ours imports": target("pnu.networks.layers.nn.Module"),
     "a class among the arguments": argument("ratio", mkdir),
     "a class among arguments that no network has": argument("more", mkdir),
     "a call that waits for arguments": argument("_partial_", lambda mark: True),

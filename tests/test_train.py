@@ -138,7 +138,7 @@ def test_config_is_resolved_and_plain(finished: Path) -> None:
     config = yaml.safe_load(text)
     assert config["data"]["seed"] == 5
     assert config["model"] == {
-        "_target_": "pnu.models.pnu.PNU",
+        "_target_": "pnu.networks.pnu.PNU",
         **{"ratio": 4, "input_normals": True, "predict_normals": True, "local_features": True, "global_features": True},
         "residual": False,
     }

@@ -12,9 +12,9 @@ import torch
 import yaml
 
 from pnu.io import read_cloud, write_cloud, write_json
-from pnu.models.pnu import PNU
+from pnu.networks.pnu import PNU
 
-MODEL = {"_target_": "pnu.models.pnu.PNU", "ratio": 2, "local_features": False}
+MODEL = {"_target_": "pnu.networks.pnu.PNU", "ratio": 2, "local_features": False}
 
 
 def make_run(folder: Path, status: str = "finished") -> Path:

@@ -9,9 +9,9 @@ from safetensors.torch import save_file
 import pnu
 from pnu import checkpoint, weights
 from pnu.export import main
-from pnu.models.surface import Surface
+from pnu.networks.surface import Surface
 
-MODEL = {"_target_": "pnu.models.surface.Surface", "neighbours": 12, "reach": 12, "width": 16}
+MODEL = {"_target_": "pnu.networks.surface.Surface", "neighbours": 12, "reach": 12, "width": 16}
 
 
 @pytest.fixture

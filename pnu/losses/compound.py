@@ -13,7 +13,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pnu.losses import neighborhood
 from pnu.ops.grouping import gather
 from pnu.ops.nearest import knn, nearest
 from pnu.ops.transport import assign
@@ -195,7 +194,7 @@ class CompoundLoss(nn.Module):
         matches = search(prediction, target, self.k, released_rounding=self.released_rounding)
         terms = {
             "cd": chamfer(prediction, target, matches, self.reduction),
-            **self._neighborhood(prediction, matches.neighbors),
+            **self.neighborhood_terms(prediction, matches.neighbors),
         }
         if self.point_knn_in == "target":
             close = gather(target, knn(prediction[..., :3], target[..., :3], self.k).idx)
@@ -208,12 +207,8 @@ class CompoundLoss(nn.Module):
         weighted = [weight * terms[name] for name, weight in self.weights.items() if weight and name in terms]
         return {**terms, "loss": torch.stack(weighted).sum() if weighted else 0 * terms["cd"]}
 
-    def _neighborhood(self, prediction: Tensor, neighbors: Tensor) -> dict[str, Tensor]:
-        """point_knn, normal_orth and normal_knn."""
-        if prediction.shape[-1] == 6 and prediction.device.type == "cpu":
-            count = neighbors.numel() if self.reduction == "mean" else len(neighbors)
-            values = neighborhood.sums(prediction, neighbors, self.absolute, TINY) / count
-            return dict(zip(("point_knn", "normal_orth", "normal_knn"), values, strict=True))
+    def neighborhood_terms(self, prediction: Tensor, neighbors: Tensor) -> dict[str, Tensor]:
+        """point_knn, and with normals normal_orth and normal_knn, of the neighbours (B, m, k) of each prediction."""
         around = gather(prediction, neighbors)
         terms = {"point_knn": point_knn(prediction, around, self.reduction)}
         if prediction.shape[-1] >= 6:

@@ -24,7 +24,7 @@ class SurfaceLoss(nn.Module):
         self.weights = {"distance": 1.0, "drift": w_drift, "normal": w_normal, "calibration": w_error}
 
     def forward(self, prediction: Tensor, target: Tensor, extra: Mapping[str, Any]) -> dict[str, Tensor]:
-        """`extra`: outputs of `models.surface.Surface`, and "surface", "index", "center", "side" of the batch."""
+        """`extra`: outputs of `networks.surface.Surface`, and "surface", "index", "center", "side" of the batch."""
         totals: dict[str, Tensor] = dict.fromkeys(self.weights, prediction.new_zeros(()))
         for query, projected, log_error, spacing in zip(
             extra["query"], extra["projected"], extra["log_error"], extra["spacing"], strict=True

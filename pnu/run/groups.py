@@ -57,7 +57,7 @@ class Data:
 class Model:
     """conf/model: the network."""
 
-    _target_: str = doc("class below pnu.models")
+    _target_: str = doc("class below pnu.networks")
     ratio: int = doc("points out for each point in: 2, 4, 8 or 16")
     input_normals: bool = doc("read the normals of the input")
     predict_normals: bool = doc("predict normals beside points")

@@ -9,7 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from pnu.models.surface import Surface
+from pnu.networks.surface import Surface
 from pnu.ops.blocks import along_curve
 from pnu.ops.frames import feet
 from pnu.ops.nearest import Search, knn

@@ -15,7 +15,7 @@ SUFFIX = ".safetensors"
 class Weights(NamedTuple):
     """A trained network."""
 
-    model: dict[str, Any]  # what `models.build` takes
+    model: dict[str, Any]  # what `networks.build` takes
     patch_size: int | None  # points of the patches that it was trained on; None: the network's default
     state: dict[str, Tensor]
 

@@ -2,8 +2,8 @@
 
 from torch import Tensor, nn
 
-from pnu.models.layers import MLP
-from pnu.models.punet import Branches, HierarchicalFeatures, check_ratio, coordinates
+from pnu.networks.layers import MLP
+from pnu.networks.punet import Branches, HierarchicalFeatures, check_ratio, coordinates
 
 
 class ECNet(nn.Module):

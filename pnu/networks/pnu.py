@@ -6,11 +6,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pnu.models.layers import MLP, Abstraction, Propagation, expand, hierarchy
-from pnu.models.neighborhoods import whole
+from pnu.networks.layers import MLP, Abstraction, JoinedMLP, PooledMLP, Propagation, expand
+from pnu.ops.grouping import gather
+from pnu.ops.sampling import farthest_points
 
 RADII = (0.1, 0.2, 0.3, 0.4)
-NEIGHBORS = 32
 MINIMUM = 64  # points of a patch: the coarsest level keeps one in 64
 
 
@@ -20,7 +20,7 @@ class LocalFeatures(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         widths = ((channels - 3, 32, 32, 64), (64, 64, 64, 128), (128, 128, 128, 256), (256, 256, 256, 512))
-        self.abstractions = nn.ModuleList(map(Abstraction, widths))
+        self.abstractions = nn.ModuleList(map(Abstraction, widths, RADII))
         self.propagations = nn.ModuleList(
             [
                 Propagation(128, channels, 128, 256),
@@ -31,15 +31,24 @@ class LocalFeatures(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        levels = hierarchy(x[..., :3].detach(), RADII, NEIGHBORS)
-        points = [x[..., :3], *(level.points for level in levels)]
-        features, skips = x[..., 3:], [x]
-        for abstraction, finer, level in zip(self.abstractions, points, levels, strict=False):
-            features = abstraction(finer, features, level)
+        points, features, skips = levels(x[..., :3], len(RADII)), x[..., 3:], [x]
+        for i, abstraction in enumerate(self.abstractions):
+            features = abstraction(points[i], features, points[i + 1])
             skips.append(features)
-        for i in reversed(range(len(levels))):
+        for i in reversed(range(len(RADII))):
             features = self.propagations[i](points[i], points[i + 1], skips[i], features)
         return features
+
+
+def levels(points: Tensor, number: int) -> list[Tensor]:
+    """Points (B, n, 3), and n, n/4, n/16 ... farthest points of them.
+
+    The order of farthest points does not depend on how many are wanted, so one run of n of n gives all levels:
+    each is the front of the one before.
+    """
+    n = points.shape[1]
+    ordered = gather(points, farthest_points(points, n, skip_near_origin=True))
+    return [points, *(ordered[:, : max(n >> 2 * level, 1)] for level in range(number))]
 
 
 class PNU(nn.Module):
@@ -78,9 +87,9 @@ class PNU(nn.Module):
         self.predicts_normals, self.residual = predict_normals, residual
         self.channels = 6 if input_normals else 3
         self.local_features = self.local(self.channels) if local_features else None
-        self.global_features = MLP((self.channels, 32, 64, 64, 128, 256, 512)) if global_features else None
+        self.global_features = PooledMLP((self.channels, 32, 64, 64, 128, 256, 512)) if global_features else None
         width = self.channels + (self.local_width if local_features else 0) + (512 if global_features else 0)
-        self.head = MLP((width, 512, 256, 128))
+        self.head = JoinedMLP((width, 512, 256, 128))
         # Released, ratio 4: 128 | 64-64-32 | 16-16. Other ratios keep these widths at both ends.
         steps = ratio.bit_length() - 1
         outputs = [64] * max(steps - 2, 0) + [32] * min(steps - 1, 1)
@@ -93,26 +102,22 @@ class PNU(nn.Module):
 
     def forward(self, patch: Tensor) -> Tensor:
         """Patches (B, n, 6) -> (B, ratio n, 6), or (B, ratio n, 3) without normals."""
-        batch, n, columns = patch.shape
+        _, n, columns = patch.shape
         if columns < self.channels or n < MINIMUM:
             raise ValueError(f"patch: expected (B, n >= {MINIMUM}, {self.channels}), got {tuple(patch.shape)}")
         x = patch[..., : self.channels].contiguous()
-        each = x if self.local_features is None else torch.cat([x, self.local_features(x)], -1)
-        # the first layer of the head is linear: its part for the global features is computed once a patch
-        of_each, of_patch = self.head.first_weight(each.shape[-1])
-        rows = F.linear(each, of_each)
-        if self.global_features is not None:
-            rows += F.linear(self.global_features(x.flatten(0, 1), groups=whole(batch, n)), of_patch)[:, None]
-        features = self.head(rows, projected=True)
+        each = x if self.local_features is None else torch.cat([x, self.local_features(x)], -1)  # (B, n, 6 + 256)
+        whole = None if self.global_features is None else self.global_features(x)  # (B, 512)
+        features = self.head(each, whole)  # (B, n, 128)
         for mlp in self.expansions:
-            features = mlp(expand(features))
+            features = mlp(expand(features))  # (B, 2 n, 32), (B, 4 n, 16)
         points = self.regression(features)
         # the released order: all first halves, then all second ones, the last expansion outermost
         steps = len(self.expansions)
         predicted = (
             points.unflatten(1, (n, *[2] * steps))
             .permute(0, *range(steps + 1, 0, -1), -1)
-            .reshape(batch, -1, points.shape[-1])
+            .reshape(len(patch), -1, points.shape[-1])
         )
         if not self.residual:
             return predicted

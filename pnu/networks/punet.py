@@ -5,13 +5,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from pnu.models.layers import MLP, Abstraction, Level
+from pnu.networks.layers import MLP, Abstraction
 from pnu.ops.grouping import gather, interpolate
-from pnu.ops.nearest import ball_query
 from pnu.ops.sampling import farthest_points
 
 RADII = (0.05, 0.1, 0.2, 0.3)
-NEIGHBORS = 32
 MINIMUM = 64
 
 
@@ -27,7 +25,7 @@ class HierarchicalFeatures(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         widths = ((0, 32, 32, 64), (64, 64, 64, 128), (128, 128, 128, 256), (256, 256, 256, 512))
-        self.abstractions = nn.ModuleList(map(Abstraction, widths))
+        self.abstractions = nn.ModuleList(map(Abstraction, widths, RADII))
         self.reductions = nn.ModuleList([MLP((level[-1], 64)) for level in widths])
 
     def forward(self, points: Tensor) -> Tensor:
@@ -35,12 +33,10 @@ class HierarchicalFeatures(nn.Module):
         ordered = gather(points, farthest_points(points, n))
         finer, features = points, points.new_zeros(*points.shape[:2], 0)
         restored = []
-        for level, radius in enumerate(RADII):
+        for level, (abstraction, reduction) in enumerate(zip(self.abstractions, self.reductions, strict=True)):
             centers = ordered[:, : n >> level]
-            features = self.abstractions[level](
-                finer, features, Level(centers, ball_query(centers, finer, radius, NEIGHBORS))
-            )
-            restored.append(self.reductions[level](interpolate(features, centers, points)))
+            features = abstraction(finer, features, centers)
+            restored.append(reduction(interpolate(features, centers, points)))
             finer = centers
         return torch.cat([*restored, points], -1)
 

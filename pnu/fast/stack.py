@@ -26,11 +26,11 @@ import torch.distributed
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pnu.models.chunks import Chunk, Scratch, group_chunks, row_chunks, spread
-from pnu.models.layer import Layer
-from pnu.models.neighborhoods import Groups, ungroup
-from pnu.models.norm import BatchNorm, check_rows, everywhere
-from pnu.ops.combine import scatter
+from pnu.fast.cache import Chunk, Scratch, group_chunks, row_chunks, spread
+from pnu.fast.combine import scatter
+from pnu.fast.groups import Groups, ungroup
+from pnu.networks.layers import Layer
+from pnu.networks.norm import BatchNorm, check_rows, everywhere
 
 FAR = 8  # deviations between threshold and mean, beyond which their difference costs too many digits
 

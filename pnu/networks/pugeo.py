@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor, nn
 
-from pnu.models.layers import MLP
-from pnu.models.norm import BatchNorm
-from pnu.models.punet import check_ratio, coordinates
+from pnu.networks.layers import MLP
+from pnu.networks.norm import BatchNorm
+from pnu.networks.punet import check_ratio, coordinates
 from pnu.ops.grouping import gather
 from pnu.ops.nearest import knn
 
@@ -16,7 +16,7 @@ WIDTHS = (64, 64, 128, 128)
 class EdgeConvolution(nn.Module):
     """Maximum over neighbours j of ReLU(BN(A x_i + B (x_j - x_i))): (B, n, C) -> (B, n, C') (DGCNN).
 
-    Both products are made before gathering: A x_i + B (x_j - x_i) = (A - B) x_i + B x_j.
+    `center` is A - B and `neighbor` B: A x_i + B (x_j - x_i) = (A - B) x_i + B x_j.
     """
 
     def __init__(self, width_in: int, width_out: int) -> None:
@@ -26,7 +26,10 @@ class EdgeConvolution(nn.Module):
         self.norm = BatchNorm(width_out)
 
     def forward(self, x: Tensor, neighbors: Tensor) -> Tensor:
-        edges = self.center(x)[:, :, None] + gather(self.neighbor(x), neighbors)
+        return self.pooled(self.center(x)[:, :, None] + self.neighbor(gather(x, neighbors)))
+
+    def pooled(self, edges: Tensor) -> Tensor:
+        """Edges (B, n, k, C'), of which the maximum is left."""
         return self.norm(edges.flatten(0, -2)).view(edges.shape).relu().amax(2)
 
 

@@ -3,12 +3,10 @@
 import torch
 from torch import Tensor, nn
 
-from pnu.models import pnu
-from pnu.models.layers import Abstraction, Level
-from pnu.ops.nearest import ball_query
+from pnu.networks import pnu
+from pnu.networks.layers import Abstraction
 
 RADII = (0.1, 0.2, 0.3, 0.4)
-NEIGHBORS = 32
 
 
 class MultiscaleFeatures(nn.Module):
@@ -21,14 +19,14 @@ class MultiscaleFeatures(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.abstraction = Abstraction((channels - 3, 32, 64, 128))
+        self.abstraction = Abstraction((channels - 3, 32, 64, 128), radius=1)
 
     def forward(self, x: Tensor) -> Tensor:
         points, features = x[..., :3], x[..., 3:]
         scales = []
         for radius in RADII:
             scaled = points / radius
-            scales.append(self.abstraction(scaled, features, Level(scaled, ball_query(scaled, scaled, 1, NEIGHBORS))))
+            scales.append(self.abstraction(scaled, features, scaled))
         return torch.stack(scales).amax(0)
 
 

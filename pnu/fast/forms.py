@@ -1,0 +1,128 @@
+"""Fast forms of the parts of `pnu.networks`. Each is a subclass that replaces `forward`.
+
+On the CPU layers run chunk by chunk (`stack`). A first layer, which is linear, multiplies before its input is gathered,
+interpolated or repeated: once a point, not once a neighbour or copy.
+"""
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from pnu.fast import stack
+from pnu.fast.combine import combine
+from pnu.fast.groups import Groups, distinct, pool, single, whole
+from pnu.networks import layers, pugeo
+from pnu.ops.grouping import gather
+from pnu.ops.nearest import ball_query, knn
+
+
+def streamed(x: Tensor, training: bool) -> bool:
+    """Whether layers run chunk by chunk (`stack`): on the CPU, but for gradients in eval mode and mixed precision."""
+    plainly = torch.is_autocast_enabled("cpu") or (torch.is_grad_enabled() and not training)
+    return x.device.type == "cpu" and not plainly
+
+
+def through(
+    mlp: layers.MLP,
+    x: Tensor,
+    *,
+    projected: bool = False,
+    groups: Groups | None = None,
+    centers: Tensor | None = None,
+) -> Tensor:
+    """Rows (..., C) through all layers.
+
+    Args:
+        projected: x already holds the products of the first layer's weight, without bias.
+        groups: x is (R, C) and the output the maximum over groups of rows, (G, C').
+        centers: (G, C), with groups: x is a table (n, C), and row r is x[source[r]] - centers[owner[r]].
+    """
+    rows = x.reshape(-1, x.shape[-1])
+    if streamed(x, mlp.training):
+        run = stack.train if mlp.training else stack.infer
+        rows = run(rows, stacked(mlp), projected=projected, groups=groups, centers=centers)
+    else:
+        if groups is not None and centers is not None:
+            rows = combine(rows, groups.source[:, None]) - centers[groups.owner]
+        for i, layer in enumerate(stacked(mlp)):
+            rows = from_products(layer, rows) if projected and i == 0 else layer(rows)
+        rows = rows if groups is None else pool(rows, groups)
+    return rows if groups is not None else rows.view(*x.shape[:-1], rows.shape[-1])
+
+
+def from_products(layer: layers.Layer, products: Tensor) -> Tensor:
+    """A layer from the products of its input (R, C) with its weight, without bias."""
+    return layer.norm(products if layer.linear.bias is None else products + layer.linear.bias).relu()
+
+
+def stacked(mlp: layers.MLP) -> Sequence[layers.Layer]:
+    return [layer for layer in mlp if isinstance(layer, layers.Layer)]
+
+
+def first_weight(mlp: layers.MLP, split: int) -> tuple[Tensor, Tensor]:
+    """Weight of the first layer for the first `split` columns of its input, and for the others."""
+    weight = stacked(mlp)[0].linear.weight
+    return weight[:, :split], weight[:, split:]
+
+
+class MLP(layers.MLP):
+    def forward(self, x: Tensor) -> Tensor:
+        return through(self, x)
+
+
+class PooledMLP(layers.PooledMLP):
+    """The maximum is taken of the last products, before batch norm and ReLU."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return through(self, x.flatten(0, 1), groups=whole(*x.shape[:2]))
+
+
+class JoinedMLP(layers.JoinedMLP):
+    """The cloud's part of the first products is computed once a cloud."""
+
+    def forward(self, each: Tensor, cloud: Tensor | None = None) -> Tensor:
+        of_each, of_cloud = first_weight(self, each.shape[-1])
+        products = F.linear(each, of_each)
+        if cloud is not None:
+            products += F.linear(cloud, of_cloud)[:, None]
+        return through(self, products, projected=True)
+
+
+class Abstraction(layers.Abstraction):
+    """An offset is point minus centre: both are multiplied, with the features, before they are gathered."""
+
+    def forward(self, points: Tensor, features: Tensor, centers: Tensor) -> Tensor:
+        (clouds, n, _), m = points.shape, centers.shape[1]
+        neighbors = ball_query(centers, points, self.radius, self.k)
+        groups = (distinct if streamed(points, self.training) else single)(neighbors, n)
+        of_offsets, _ = first_weight(self.mlp, 3)
+        of_points = F.linear(torch.cat([points, features], -1).flatten(0, 1), stacked(self.mlp)[0].linear.weight)
+        of_centers = F.linear(centers.reshape(-1, 3), of_offsets)
+        return through(self.mlp, of_points, projected=True, groups=groups, centers=of_centers).view(clouds, m, -1)
+
+
+class Propagation(layers.Propagation):
+    """Features are multiplied at the coarse points, then interpolated."""
+
+    def forward(self, fine_points: Tensor, coarse_points: Tensor, skip: Tensor, features: Tensor) -> Tensor:
+        clouds, m, _ = coarse_points.shape
+        dist_sq, idx = knn(fine_points, coarse_points, min(3, m))
+        inverse = 1 / (dist_sq.sqrt() + 1e-8)
+        inverse = inverse / inverse.sum(-1, keepdim=True)
+        idx = idx + torch.arange(clouds, device=idx.device).view(-1, 1, 1) * m
+        of_features, of_skip = first_weight(self.mlp, features.shape[-1])
+        rows = combine(F.linear(features.flatten(0, 1), of_features), idx.flatten(0, 1), inverse.flatten(0, 1))
+        rows = torch.addmm(rows, skip.flatten(0, 1), of_skip.t())
+        return through(self.mlp, rows, projected=True).view(clouds, fine_points.shape[1], -1)
+
+
+class EdgeConvolution(pugeo.EdgeConvolution):
+    """Neighbours are multiplied before they are gathered."""
+
+    def forward(self, x: Tensor, neighbors: Tensor) -> Tensor:
+        return self.pooled(self.center(x)[:, :, None] + gather(self.neighbor(x), neighbors))
+
+
+ALL: tuple[type[nn.Module], ...] = (MLP, PooledMLP, JoinedMLP, Abstraction, Propagation, EdgeConvolution)
