@@ -116,7 +116,7 @@ def test_the_search_for_commands_finds_them(tmp_path: Path) -> None:
 
 # where a line is made -> the test below that runs it
 PLACES = {
-    "prepare.py prepare": "test_from_patches_to_a_picture",
+    "prepare.py next_line": "test_from_patches_to_a_picture",
     "run/table.py closing": "test_from_patches_to_a_picture",
     "upsample.py upsample": "test_from_patches_to_a_picture",
     "reconstruct.py reconstruct": "test_from_patches_to_a_picture",
