@@ -7,7 +7,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup check test coverage train sweep board bench clean
+.PHONY: help setup check test nightly coverage train sweep board bench clean
 
 help:   ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -28,8 +28,11 @@ check: $(STAMP)   ## lint, format and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-test: $(STAMP)   ## the test suite (minutes); ARGS="-m slow" for the slow ones
+test: $(STAMP)   ## the test suite (minutes); the slow ones: nightly
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto $(ARGS)
+
+nightly: $(STAMP)   ## the slow tests from start to end and a summary: kill -9, several processes, fuzzing, documented commands (an hour)
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.nightly $(ARGS)
 
 coverage: $(STAMP)   ## the test suite, and which lines of pnu/ it does not reach
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --cov=pnu $(ARGS)

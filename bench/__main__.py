@@ -17,6 +17,7 @@ import torch
 from bench import inference, ops, scale, step
 from bench.timing import Row
 from pnu.io import atomic_path, write_json
+from pnu.run.provenance import provenance
 
 PARTS: dict[str, Callable[[], Iterable[Row]]] = {
     "ops": ops.rows,
@@ -27,18 +28,13 @@ PARTS: dict[str, Callable[[], Iterable[Row]]] = {
 PACKAGES = ("torch", "numpy", "scipy", "fpsample", "open3d")
 
 
-def machine() -> dict[str, str]:
+def facts() -> dict[str, str]:
     """What the figures depend on."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").is_file() else []
-    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     return {
-        "processor": models[0] if models else platform.processor() or platform.machine(),
+        "made": provenance([1]),
         "cores": str(os.cpu_count()),
-        "GPU": gpu,
         "system": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
         "versions": ", ".join(f"{name} {version(name)}" for name in PACKAGES),
-        "threads": str(torch.get_num_threads()),
     }
 
 
@@ -49,8 +45,8 @@ def markdown(facts: dict[str, str], rows: list[Row], notes: list[str]) -> str:
         ours, *_ = row.seconds
         for other, ratio in row.ratios.items():
             lines.append(f"| {row.name} | {row.seconds[ours]:.3g} | {other} | {ratio:.1f} |")
-    text = ["; ".join(f"{key}: {value}" for key, value in facts.items()), "", *lines] if rows else []
-    return "\n".join([*text, *notes]) + "\n"
+    text = ["; ".join(f"{key}: {value}" for key, value in facts.items()), ""]
+    return "\n".join([*text, *(lines if rows else []), *notes]) + "\n"
 
 
 def main() -> None:
@@ -68,7 +64,7 @@ def main() -> None:
     wanted = arguments.parts or [*PARTS, "scale"]
     torch.set_num_threads(arguments.threads)
     arguments.folder.mkdir(parents=True, exist_ok=True)
-    started, facts = time.perf_counter(), machine()
+    started, known = time.perf_counter(), facts()
     rows: list[Row] = []
     notes: list[str] = []
     for name, measure in PARTS.items():
@@ -84,12 +80,12 @@ def main() -> None:
     if curve:
         notes += ["", *scale.lines(curve)]
         scale.plot(curve, arguments.folder / "scale.png")
-    table = markdown(facts, rows, notes)
+    table = markdown(known, rows, notes)
     stem = "bench" if not arguments.parts else "_".join(wanted)
     with atomic_path(arguments.folder / f"{stem}.md") as path:
         path.write_text(table, encoding="utf-8")
     content = {
-        "machine": facts,
+        "machine": known,
         "rows": [{"name": row.name, "seconds": row.seconds, "ratios": row.ratios} for row in rows],
         "step": profile._asdict() if profile else None,
         "scale": [point._asdict() for point in curve],

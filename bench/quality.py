@@ -25,6 +25,7 @@ from pnu.io import atomic_path, read_json, write_cloud, write_json, write_mesh
 from pnu.metrics.raycast import closest_points
 from pnu.ops.mesh import vertex_normals
 from pnu.ops.normals import estimate_normals
+from pnu.run.provenance import provenance
 from pnu.upsamplers import CLASSICAL, Upsampler, classical
 
 
@@ -156,7 +157,8 @@ def written(output: Path) -> str:
     lines = [*cloud_lines(rows), "", LEGEND.format(shapes=len({row["shape"] for row in rows}))] if rows else []
     if meshes:
         lines += ["", *surface_lines(meshes), "", "Distances in 1/1000 of the true radius."]
-    return "\n".join(lines) + "\n"
+    made = dict.fromkeys(content["made"] for content in found if "made" in content)
+    return "\n".join([*lines, "", *made]) + "\n"
 
 
 def main() -> None:
@@ -184,7 +186,7 @@ def main() -> None:
         kept = [row for row in content[part] if row["method"] not in {row["method"] for row in new}]
         order = [*METHODS, "input"]
         content[part] = sorted(new + kept, key=lambda row: order.index(row["method"]) if row["method"] in order else -1)
-        write_json(path, content | {"data": found.name, "seed": arguments.seed})
+        write_json(path, content | {"data": found.name, "seed": arguments.seed, "made": provenance([1])})
         print("\n".join((surface_lines if arguments.surfaces else cloud_lines)(new)), flush=True)
     with atomic_path(arguments.output / "quality.md") as path:
         path.write_text(written(arguments.output), encoding="utf-8")

@@ -19,7 +19,10 @@ from pnu.checkpoint import read, write
 from pnu.ops.colors import normal_colors
 from pnu.pictures import figure, look_at, render_cloud, save_png
 from pnu.run import RunFolder, build
+from pnu.run.folder import UNHASHED, UNHASHED_DATA
 from pnu.runtime.progress import bar
+
+CLOUDS_3D = 4  # shapes in TensorBoard's 3D tab
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -177,13 +180,14 @@ class Pictures(pl.Callback):
 
     Args:
         run: whose folder pictures/ gets the PNGs.
-        clouds: how many, each of another shape as far as there are as many; 0: none.
-        points: of a 3D cloud at most, more make the tab slow.
+        clouds: how many, each of another shape as far as there are as many; 0: none. TensorBoard's 3D tab, which loads
+            all it has, gets the first four.
+        points: of a 3D cloud at most.
         every: validations from one picture to the next; the last one of a training is always drawn.
         size: pixels of a panel's side.
     """
 
-    def __init__(self, run: RunFolder, clouds: int = 4, points: int = 4096, every: int = 10, size: int = 320) -> None:
+    def __init__(self, run: RunFolder, clouds: int = 4, points: int = 2048, every: int = 10, size: int = 320) -> None:
         if clouds < 0 or min(points, every, size) < 1:
             raise ValueError("callbacks.pictures: expected clouds >= 0 and points, every, size >= 1")
         self.folder, self.clouds, self.points, self.every, self.size = run.pictures, clouds, points, every, size
@@ -221,17 +225,22 @@ class Pictures(pl.Callback):
         first, self.drawn = self.drawn < 0, trainer.global_step
         training, writer = module.training, board(trainer)
         module.eval()
-        for sample in self.samples:
+        for index, sample in enumerate(self.samples):
             with torch.no_grad():
                 prediction = module(sample["input"][None].to(module.device))[0].float().cpu()
             clouds = {"prediction": prediction.numpy()}
             if first:
                 clouds |= {name: sample[name].numpy() for name in ("input", "target")}
             for name, cloud in clouds.items():
-                if writer is not None:
+                if writer is not None and index < CLOUDS_3D:
                     shown = cloud[:: -(-len(cloud) // self.points)]
-                    tag = f"{sample['shape']}/{name}"
-                    writer.add_mesh(tag, shown[None, :, :3], normal_colors(unit(shown))[None], global_step=self.drawn)
+                    writer.add_mesh(
+                        f"{sample['shape']}/{name}",
+                        shown[None, :, :3],
+                        normal_colors(unit(shown))[None],
+                        config_dict={"material": {"cls": "PointsMaterial", "size": point_size(shown[:, :3])}},
+                        global_step=self.drawn,
+                    )
             picture = self.picture(sample, prediction.numpy())
             if picture is not None:
                 save_png(self.folder / f"{sample['shape']}_{self.drawn:07d}.png", picture)
@@ -271,15 +280,25 @@ class Board(pl.Callback):
             metrics = {
                 name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("test/")
             }
-            for summary in hparams(hyperparameters(self.config), metrics):
+            # without the first summary, a list of all keys, TensorBoard makes its own: those first that differ
+            for summary in hparams(hyperparameters(self.config), metrics)[1:]:
                 writer.file_writer.add_summary(summary)
             writer.flush()
 
 
+def point_size(points: np.ndarray) -> float:
+    """About the distance of neighbors among points (n, 3) on a surface; TensorBoard's own size is hardly to be seen."""
+    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    return float(f"{max(extent, 1e-3) / len(points) ** 0.5:.3g}")
+
+
 def hyperparameters(config: Mapping[str, Any], prefix: str = "") -> dict[str, bool | int | float | str]:
-    """The config's values under their dotted keys, as TensorBoard wants them."""
+    """The config's values under their dotted keys, as TensorBoard wants them; without those that change no result."""
     flat: dict[str, bool | int | float | str] = {}
+    unused = {"": UNHASHED, "data.": UNHASHED_DATA}.get(prefix, ())
     for name, value in config.items():
+        if name in unused:
+            continue
         if isinstance(value, Mapping):
             flat |= hyperparameters(value, f"{prefix}{name}.")
         elif value is not None and not str(name).startswith("_partial_"):

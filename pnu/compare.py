@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pnu.run import command, doc, find_metric
 from pnu.run.groups import Data
+from pnu.run.provenance import provenance
 from pnu.run.quoting import quoted, typed_line
 from pnu.runtime.progress import steps
 
@@ -89,8 +90,9 @@ def compare(cfg: Any) -> None:
             rows,
             list(shown.values()),
             title=f"Point cloud upsampling, {cfg.ratio:g} times: {', '.join(methods)}",
-            head=[evaluation.legend(rows), *seen, f"Made by: {typed_line()}"],
-            settings={key: cfg[key] for key in SETTINGS} | {"data": source.name, "versions": versions()},
+            head=[evaluation.legend(rows), *seen, f"Made by: {typed_line()}", provenance([1])],
+            settings={key: cfg[key] for key in SETTINGS}
+            | {"data": source.name, "versions": versions(), "made": provenance([1])},
             rebuilt_kinds=rebuilt_kinds,
             look=comparison.Look(cfg.up, cfg.azimuth, cfg.elevation, cfg.size, cfg.colormap),
             page_mb=cfg.page_mb,

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 from pnu.run import command, doc, find_metric, shell_line
 from pnu.run.groups import Data
+from pnu.run.provenance import provenance
 from pnu.runtime.progress import steps
 
 NORMALS = {"given": "as given", "estimate": "estimated"}
@@ -93,10 +94,11 @@ def evaluate(cfg: Any) -> None:
                 metrics=chosen,
             )
         )
-    head = {key: cfg[key] for key in SETTINGS} | {"subject": subject, "data": source.name}
+    made = provenance([1])
+    head = {key: cfg[key] for key in SETTINGS} | {"subject": subject, "data": source.name, "made": made}
     evaluation.write_results(output, rows, head, chosen)
     if not cfg.quiet:
-        evaluation.print_tables(rows, f"{subject}, normals of the input {NORMALS[cfg.normals]}", chosen)
+        evaluation.print_tables(rows, f"{subject}, normals of the input {NORMALS[cfg.normals]}. {made}", chosen)
         print(f"output: {output}/metrics.json, metrics.csv{', clouds/' if cfg.save else ''}")
         data = {"data": "meshes", "data.root": cfg.data.root} if cfg.data.get("root") else {}
         rival = "poisson" if subject == "apss" else "apss"

@@ -6,6 +6,7 @@ from typing import Any
 
 from pnu.run import build, closing, command, doc, find_metric, is_main_process, job_line, objective, open_run
 from pnu.run.groups import Callbacks, Data, Logger, Loss, Model, Optimizer, Scheduler, Trainer
+from pnu.run.provenance import machine
 
 
 @dataclass
@@ -71,10 +72,10 @@ def train(cfg: Any) -> list[float] | None:
             default_root_dir=run.path,
             **lit.TRAINER_OPTIONS,
         )
-        record["device"] = str(trainer.strategy.root_device)
+        record |= {"device": str(trainer.strategy.root_device), "machine": machine()}
         start = run.last if run.last.exists() else None
         if start is None:
-            run.add_metrics("untrained", trainer.validate(module, data, verbose=False))
+            run.add_metrics("start" if source else "untrained", trainer.validate(module, data, verbose=False))
         trainer.fit(module, data, ckpt_path=start, weights_only=True)
         if run.best.exists():
             module.load_state_dict(checkpoint.read(run.best)["state_dict"])

@@ -24,8 +24,8 @@ from pnu.comparison.tables import tables
 from pnu.metrics import METRICS
 from pnu.page import write_page
 from pnu.report import main
-from pnu.study import collect, write_report
-from pnu.study.plots import front, logarithmic, plots
+from pnu.study import collect, texts, write_report
+from pnu.study.plots import front, logarithmic, mean_curve, plots
 from pnu.study.settings import Setting, effects
 from pnu.study.texts import differing
 from pnu.train import main as train
@@ -80,6 +80,31 @@ def test_mean_spread_and_difference_by_hand(make: Make) -> None:
     # 0.05 apart; two runs differ by sqrt(0.1^2 + 0.1414^2) = 0.173
     assert (same.difference, same.exceeds) == (pytest.approx(0.05), False)
     assert [run.record["error"] for run in study.unfinished] == ["NonFinite: step 3"]
+
+
+def test_a_step_done_twice_counts_once(make: Make) -> None:
+    from torch.utils.tensorboard import SummaryWriter
+
+    folder = make(0, "default", 0, 0.1)
+    for start in (0, 2):  # two starts, the second of which does steps 2 to 4 again
+        with SummaryWriter(str(folder / "0" / "tensorboard"), filename_suffix=f".{start}") as writer:
+            for step in range(start, start + 5):
+                writer.add_scalar("val/normal_deg", 10 * start + step, step)
+        time.sleep(1.1)  # the name of a file has its second
+    curve = mean_curve(collect(folder).settings[0], "val/normal_deg")
+    assert curve == [(0, 0), (1, 1), (2, 22), (3, 23), (4, 24), (5, 25), (6, 26)]
+
+
+def test_a_report_tells_revision_machine_and_seeds(make: Make) -> None:
+    folder = three_settings(make)
+    for path in folder.glob("*/run.json"):
+        record = json.loads(path.read_text())
+        path.write_text(json.dumps(record | {"git": "0123456789abcdef+", "machine": "Xeon, 2 threads"}))
+    line = "Revision 0123456789+; Xeon, 2 threads; 2 to 3 seeds."
+    assert line in texts.facts(collect(folder))
+    write_report(collect(folder), folder / "report")
+    assert line in (folder / "report" / "report.md").read_text()
+    assert line in (folder / "report" / "report.html").read_text()
 
 
 def test_one_seed_has_no_spread(make: Make) -> None:
@@ -398,7 +423,10 @@ def test_clouds_are_served_with_points_and_colours(ask: Callable[..., Any]) -> N
 def test_hyperparameters_are_served_with_the_final_metrics(ask: Callable[..., Any], swept: Path) -> None:
     experiment = ask("data/plugin/hparams/experiment", {})
     assert "test/chamfer_sq" in {info["name"]["tag"] for info in experiment["metricInfos"]}
-    assert {"loss.w2", "seed"} <= {info["name"] for info in experiment["hparamInfos"]}
+    names = [info["name"] for info in experiment["hparamInfos"]]
+    differing_keys = {"loss.w2", "loss.w3", "loss.w4", "loss.w5", "seed", "data.seed"}
+    assert set(names[:6]) == differing_keys, "what differs comes first"
+    assert [info.get("differs", False) for info in experiment["hparamInfos"]] == [True] * 6 + [False] * (len(names) - 6)
     wanted = {"allowedStatuses": ["STATUS_UNKNOWN", "STATUS_SUCCESS", "STATUS_FAILURE", "STATUS_RUNNING"]}
     wanted |= {"colParams": [{"metric": {"tag": "test/chamfer_sq"}}], "startIndex": 0, "sliceSize": 100}
     groups = ask("data/plugin/hparams/session_groups", wanted)["sessionGroups"]

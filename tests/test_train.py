@@ -3,6 +3,7 @@
 import importlib.metadata
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -93,6 +94,7 @@ def test_hydras_folder_is_the_run_folder(train: Train, tmp_path: Path, capsys: p
     assert record(run)["status"] == "finished"
     assert (run / "checkpoints/last.ckpt").exists()
     assert not (tmp_path / "outputs").exists()
+    assert re.search(r"\d threads?\b", record(run)["machine"])
     main([*line, "hydra.run.dir=same", f"run={tmp_path}/same"])
     assert record(tmp_path / "same")["status"] == "finished"
     error = refused(capsys, main, [*line, "hydra.run.dir=one", "run=two"])
@@ -212,8 +214,33 @@ def test_hyperparameters_come_with_final_metrics(finished: Path) -> None:
     values = start.session_start_info.hparams
     assert values["loss.w1"].number_value == 1
     assert values["seed"].number_value == 5
-    experiment = plugin_data_pb2.HParamsPluginData.FromString(data["_hparams_/experiment"].plugin_data.content)
-    assert "test/chamfer_sq" in {info.name.tag for info in experiment.experiment.metric_infos}
+    assert not {"run", "quiet", "name", "data.workers"} & set(values), "they change no result"
+    assert "_hparams_/experiment" not in data, "with it TensorBoard cannot tell what differs"
+
+
+def test_points_of_the_3d_tab_are_as_large_as_their_spacing(finished: Path) -> None:
+    from tensorboard.plugins.mesh import plugin_data_pb2
+    from tensorboard.util import tensor_util
+
+    data = events(finished).summary_metadata
+    (tag,) = (tag for tag in list(data) if tag.endswith("target_VERTEX") and "ellipsoid" in tag)
+    config = plugin_data_pb2.MeshPluginData.FromString(data[tag].plugin_data.content).json_config
+    points = tensor_util.make_ndarray(events(finished).Tensors(tag)[0].tensor_proto)[0]
+    spacing = np.linalg.norm(points[:, None] - points[None], axis=2)
+    spacing[np.diag_indices(len(points))] = np.inf
+    material = json.loads(config)["material"]
+    assert material["cls"] == "PointsMaterial"
+    assert 0.5 < material["size"] / np.median(spacing.min(1)) < 3
+
+
+def test_a_few_clouds_at_most_go_to_the_3d_tab(train: Train, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(callbacks, "CLOUDS_3D", 1)
+    run = train(
+        "callbacks.pictures.clouds=2", "callbacks.pictures.size=32", "trainer.max_steps=1", "data.val_share=0.4"
+    )
+    found = events(run)
+    assert len(found.Tags()["images"]) == 2
+    assert len({tag.partition("/")[0] for tag in found.Tags()["tensors"] if "VERTEX" in tag}) == 1
 
 
 def test_pictures_show_the_first_and_the_last_validation(finished: Path) -> None:
@@ -225,9 +252,13 @@ def test_pictures_show_the_first_and_the_last_validation(finished: Path) -> None
 
 
 def test_the_end_tells_what_came_out_and_how_to_go_on(train: Train, capsys: pytest.CaptureFixture[str]) -> None:
-    run = train("trainer.max_steps=1", "quiet=false")
+    run = train("trainer.max_steps=1", "trainer.val_check_interval=1", "quiet=false")
     out = capsys.readouterr().out
     assert "CD x 1e3" in out
+    assert "untrained  best validation" in out
+    assert (
+        "\nuntrained and best validation: on the validation's shapes; test: on other shapes, with the network of" in out
+    )
     assert f"run folder: {run}" in out
     assert f"next: python -m pnu.upsample input=cloud.ply output=dense.ply run={run}" in out
 
@@ -312,13 +343,37 @@ def test_a_run_that_ended_within_an_epoch_can_be_made_longer(train: Train, steps
     assert same(weights(run), weights(train(*options, "trainer.max_steps=6", run="whole")))
 
 
-def test_a_run_without_checkpoint_starts_again(train: Train) -> None:
+def test_a_run_without_checkpoint_starts_again(train: Train, capsys: pytest.CaptureFixture[str]) -> None:
     run = train("trainer.max_epochs=1")
     final = weights(run)
     shutil.rmtree(run / "checkpoints")
     (run / "checkpoints").mkdir()
+    assert len(events(run).Scalars("train/loss")) == 4
     resume(run)
     assert same(weights(run), final)
+    told = capsys.readouterr().err
+    assert told == (
+        f"{run}: no checkpoint to go on from, starts anew; removed what was left: tensorboard, metrics.json\n"
+    )
+    raw = [event.step for path in run.glob("tensorboard/events*") for event in raw_scalars(path, "train/loss")]
+    assert raw == [0, 1, 2, 3], "each step once, also for those that read the files as they are"
+    assert len(record(run)["resumed"]) == 1
+
+
+def raw_scalars(path: Path, tag: str) -> list[Any]:
+    """Events of one file with that scalar, those too that a later start takes back."""
+    from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
+
+    return [event for event in EventFileLoader(str(path)).Load() if any(v.tag == tag for v in event.summary.value)]
+
+
+def test_a_finished_run_without_its_last_checkpoint_is_kept(train: Train, capsys: pytest.CaptureFixture[str]) -> None:
+    run = train("trainer.max_steps=2", "trainer.val_check_interval=2")
+    (run / "checkpoints/last.ckpt").unlink()
+    error = refused(capsys, main, [f"run={run}", "resume=true"])
+    assert f"has no last.ckpt to go on from; python -m pnu.train weights={run} starts from it" in error
+    assert (run / "checkpoints/best.ckpt").exists()
+    assert record(run)["status"] == "finished"
 
 
 def test_a_run_of_an_older_version_goes_on(train: Train) -> None:
@@ -500,13 +555,17 @@ def test_without_validation_and_test(train: Train) -> None:
     assert not (run / "checkpoints/best.ckpt").exists()
 
 
-def test_training_goes_on_from_given_weights(train: Train, finished: Path) -> None:
+def test_training_goes_on_from_given_weights(train: Train, finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Started from a run's weights, the network before its first step is that run's."""
-    first = train("trainer.max_steps=1", f"weights={finished}", "seed=9")
+    first = train("trainer.max_steps=1", "trainer.val_check_interval=1", f"weights={finished}", "seed=9", "quiet=false")
+    out = capsys.readouterr().out
+    assert re.search(r"sphere +start +best validation +test\n", out)
+    assert "start and best validation: on the validation's shapes" in out
     metrics = json.loads((first / "metrics.json").read_text())
     before = json.loads((finished / "metrics.json").read_text())
-    assert metrics["untrained"]["chamfer_sq"] == pytest.approx(before["validation"]["chamfer_sq"], rel=1e-4)
-    assert metrics["untrained"]["chamfer_sq"] != pytest.approx(before["untrained"]["chamfer_sq"], rel=1e-2)
+    assert "untrained" not in metrics
+    assert metrics["start"]["chamfer_sq"] == pytest.approx(before["validation"]["chamfer_sq"], rel=1e-4)
+    assert metrics["start"]["chamfer_sq"] != pytest.approx(before["untrained"]["chamfer_sq"], rel=1e-2)
 
 
 def test_weights_of_another_network_are_refused(train: Train, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -20,6 +21,7 @@ from pnu.run.quoting import shell_line, typed_line
 
 INTERRUPTED = 130  # exit code of a program that Ctrl-C ends
 PACKAGES = ("pnu", "torch", "lightning", "numpy", "scipy", "hydra-core")
+TRAINED = ("checkpoints", "tensorboard", "csv", "pictures", "metrics.json")  # what a training makes in its folder
 # keys that change where or how a run is told about, not what it computes
 UNHASHED = ("run", "resume", "name", "quiet", "logger", "sweep", "objective", "metrics", "allow")
 UNHASHED_DATA = ("quiet", "workers", "cache")
@@ -65,6 +67,16 @@ class RunFolder:
         for name in ("checkpoints", "tensorboard", "pictures"):
             (self.path / name).mkdir(parents=True, exist_ok=True)
         self.write_config(config)
+
+    def start_anew(self) -> None:
+        """Remove what an earlier start left, which has no checkpoint to go on from, and say so."""
+        made = [self.path / name for name in TRAINED]
+        left = [path for path in made if path.is_file() or (path.is_dir() and any(path.iterdir()))]
+        for path in left:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        if left:
+            names = ", ".join(path.name for path in left)
+            print(f"{self}: no checkpoint to go on from, starts anew; removed what was left: {names}", file=sys.stderr)
 
     @classmethod
     def existing(cls, path: str | Path | None) -> "RunFolder":
@@ -187,17 +199,20 @@ def versions() -> dict[str, str]:
 
 
 def git_revision() -> str | None:
-    """Of the checkout that the package runs from, with "+" if it has changes; None outside a checkout."""
+    """Of the checkout that the package runs from, None outside one; with "+" if it has changes, or files under pnu/ or
+    conf/ that git does not know."""
     here = Path(__file__).resolve().parents[2]
     if not (here / ".git").exists():
         return None
     try:
         options = {"cwd": here, "capture_output": True, "text": True, "timeout": 10, "check": True}
         revision = subprocess.run(["git", "rev-parse", "HEAD"], **options).stdout.strip()  # type: ignore[call-overload]
-        changes = subprocess.run(["git", "status", "--porcelain", "-uno"], **options).stdout  # type: ignore[call-overload]
+        status = ["git", "status", "--porcelain", "-uall"]
+        lines = subprocess.run(status, **options).stdout.splitlines()  # type: ignore[call-overload]
     except (OSError, subprocess.SubprocessError):
         return None
-    return revision + ("+" if changes.strip() else "")
+    changes = [line for line in lines if not line.startswith("??") or re.match(r'\?\? "?(pnu|conf)/', line)]
+    return revision + "+" * bool(changes)
 
 
 def now() -> str:

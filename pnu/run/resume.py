@@ -10,6 +10,7 @@ from pnu.io import remove_leftovers
 from pnu.run import sweep
 from pnu.run.config import flatten, in_multirun
 from pnu.run.folder import RunFolder, is_main_process
+from pnu.run.quoting import shell_line
 from pnu.run.schema import check
 
 # What may change when a run goes on: how long, where and how loud, not what is learnt.
@@ -59,7 +60,14 @@ def open_run(cfg: Any, schema: type) -> tuple[RunFolder, dict[str, Any]]:
         if is_main_process():
             run.lock = sweep.locked(run.path)
             remove_leftovers(run.path)
-            run.write_config(config)
+            if not run.last.exists():
+                if run.best.exists() and run.read_record().get("status") == "finished":
+                    cure = shell_line("train", weights=run)
+                    raise ValueError(
+                        f"run={run}: has finished, and has no last.ckpt to go on from; {cure} starts from it"
+                    )
+                run.start_anew()
+            run.prepare(config)
         return run, config
     if not is_main_process():
         path = os.environ.get(VARIABLE) or config["run"]

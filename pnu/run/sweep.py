@@ -11,7 +11,6 @@ import hashlib
 import os
 import platform
 import re
-import shutil
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -93,8 +92,7 @@ def job_folder(config: Mapping[str, Any]) -> RunFolder:
     if folder.read_record().get("status") == "finished":
         folder.skip = "has finished before, skipped"
     if not folder.skip and not folder.last.exists():  # nothing to go on from
-        for entry in folder.path.iterdir():
-            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+        folder.start_anew()
     choices = hydra.runtime.choices
     folder.facts = {"job": hydra.job.num, "setting": choices.get("setting"), "ablation": choices.get("ablation")}
     return folder

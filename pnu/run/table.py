@@ -10,7 +10,8 @@ from pnu.run.quoting import shell_line
 if TYPE_CHECKING:
     from pnu.metrics import Shown
 
-TITLES = {"untrained": "untrained", "validation": "best validation", "test": "test"}
+# section of metrics.json -> its column; "start": of a run that began from given weights
+TITLES = {"untrained": "untrained", "start": "start", "validation": "best validation", "test": "test"}
 
 
 def objective(config: Mapping[str, Any], run: RunFolder) -> list[float] | None:
@@ -66,5 +67,9 @@ def closing(run: RunFolder) -> str:
         for row in rows
     ]
     lines.insert(1, "-" * len(lines[0]))
+    if "test" in columns and len(columns) > 1:
+        others = " and ".join(TITLES[name] for name in columns if name != "test")
+        chosen = ", with the network of the best validation" * ("validation" in columns)
+        lines.append(f"{others}: on the validation's shapes; test: on other shapes{chosen}")
     upsample = shell_line("upsample", input="cloud.ply", output="dense.ply", run=run)
     return "\n".join(["", *lines, "", f"run folder: {run}", f"next: {upsample}"])

@@ -233,7 +233,8 @@ def mean_curve(setting: Setting, name: str, points: int = 200) -> Curve:
         events = EventAccumulator(str(folder), size_guidance={"scalars": 0}).Reload()
         if name not in events.Tags()["scalars"]:
             return []
-        curve = [(float(event.step), event.value) for event in events.Scalars(name)]
+        # a step that an interrupted run did twice counts once, as it was done last
+        curve = sorted({float(event.step): event.value for event in events.Scalars(name)}.items())
         if name.startswith("train/"):
             size = max(20, len(curve) // points)
             blocks = [curve[i : i + size] for i in range(0, len(curve), size)]

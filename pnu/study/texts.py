@@ -11,6 +11,7 @@ from PIL import Image
 
 from pnu import page
 from pnu.io import atomic_path
+from pnu.run.provenance import provenance
 from pnu.run.quoting import retyped
 from pnu.study.pictures import sheets
 from pnu.study.plots import Plot, plots
@@ -54,14 +55,13 @@ def facts(study: Study) -> list[str]:
     finished = [run for setting in study.settings for run in setting.runs]
     hours = sum(float(run.record.get("wall_s", 0)) for run in finished) / 3600
     counts = sorted({len(setting.runs) for setting in study.settings})
-    revisions = {str(run.record.get("git")) for run in finished}
+    known = {key: [str(run.record[key]) for run in finished if run.record.get(key)] for key in ("git", "machine")}
     seeds = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
     lines = [
         f"{len(study.settings)} settings, {seeds} seeds each, {len(finished)} finished runs, {hours:.2f} hours.",
         f"Baseline: {study.baseline.name}.",
     ]
-    if len(revisions) > 1:
-        lines.append(f"The runs are of {len(revisions)} revisions of the program: {', '.join(sorted(revisions))}.")
+    lines.append(provenance(counts, known["git"], known["machine"]))
     if study.unfinished:
         lines.append(f"{len(study.unfinished)} runs have not finished, see the end.")
     return lines
