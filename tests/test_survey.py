@@ -88,3 +88,11 @@ def test_a_point_far_from_all_others_is_named() -> None:
     assert any(line.startswith("1 of the points lie far from all others (number 18") for line in found.warnings())
     two = np.vstack([sphere(500), sphere(500) + [9, 0, 0]])  # two things are no outliers
     assert survey(two).far == 0
+
+
+def test_some_normals_may_be_missing() -> None:
+    points = sphere(2000)
+    normals = np.where(RNG.random((2000, 1)) < 0.1, np.nan, points)
+    found, all_known = survey(points, normals), survey(points, points)
+    assert found.noise == pytest.approx(all_known.noise, rel=0.5)
+    assert found.contradicting == 0

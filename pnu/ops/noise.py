@@ -19,8 +19,8 @@ def noise_level(points: Tensor, normals: Tensor | None = None) -> float:
 
     Residual of quadratic fits to small neighbourhoods, at the quietest tenth of a thousand places. Good to about a
     quarter from 0.1 to 0.8 spacings; below, it is an upper bound: curvature that the points do not resolve counts as
-    noise, and so do walls that are thin beside the spacing, unless `normals` (n, 3) tell their sides apart.
-    0 where there are too few points to tell: fewer than 16, or hardly ten of like side around most places.
+    noise, and so do walls that are thin beside the spacing, unless `normals` (n, 3) tell their sides apart (NaN: not
+    known). 0 where there are too few points to tell: fewer than 16, or hardly ten of like side around most places.
     """
     xyz = points.detach().double()
     level = 0.0
@@ -31,7 +31,7 @@ def noise_level(points: Tensor, normals: Tensor | None = None) -> float:
         dist_sq, idx = (found[0] for found in knn(xyz[None, places], xyz[None], k))
         weight = torch.ones_like(dist_sq)
         if normals is not None:
-            weight = ((normals[idx] * normals[places, None]).sum(-1) > 0.3).double()
+            weight = (~((normals[idx] * normals[places, None]).sum(-1) <= 0.3)).double()  # NaN: no side is known
         quietest = _residuals(xyz[idx], weight).quantile(QUIET).item()
         if not math.isfinite(quietest):
             continue
