@@ -1,6 +1,7 @@
 """Training data of the surface model: crops, true surfaces, order, and one training step."""
 
 import pickle
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -148,6 +149,25 @@ def test_processes_draw_different_clouds(folder: Path) -> None:
         assert torch.equal(torch.stack([ours, theirs], 1).flatten(0, 1), both)
     assert not any(torch.equal(a, b) for a in torch.cat(parts[0]) for b in torch.cat(parts[1]))
     assert sorted(shapes_of) == sorted([[name] for name in NAMES[:2]])
+
+
+def test_same_clouds_with_a_worker(folder: Path) -> None:
+    """Started anew, not forked, as for patches."""
+    alone, loaded = (data_module(folder, workers=workers, clouds=4) for workers in (0, 1))
+    for data in (alone, loaded):
+        data.setup()
+    assert all(map(torch.equal, inputs(alone), inputs(loaded)))
+
+
+def test_open_meshes_are_counted(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data_module(folder).setup()
+    assert capsys.readouterr().err == ""
+    for path in folder.iterdir():
+        shutil.copy(path, tmp_path)
+    mesh = shapes.make("dice")
+    write_mesh(tmp_path / "hole.ply", Mesh(mesh.vertices, mesh.faces[1:]))
+    data_module(tmp_path).setup()
+    assert "1 of 4: hole (3)" in capsys.readouterr().err
 
 
 def test_a_process_without_validation_clouds_takes_them_all(folder: Path) -> None:

@@ -315,6 +315,15 @@ def test_training_seeds_are_spread_and_pushed_outward() -> None:
     assert torch.cdist(parents, patch[0, :20, :3]).amin(1).max() < 1e-4
 
 
+def test_more_seeds_than_a_crop_can_bear_are_refused() -> None:
+    patch = sphere(16).float()[None]
+    assert Surface(queries=48).outputs(patch)["prediction"].shape == (1, 48, 6)
+    with pytest.raises(
+        ValueError, match=r"model\.queries=49: expected at most 3 times .* found 16 points; raise data.size"
+    ):
+        Surface(queries=49).outputs(patch)
+
+
 def test_every_stage_of_a_large_run_moves(monkeypatch: pytest.MonkeyPatch) -> None:
     from pnu.ops import sampling, spread
 

@@ -139,6 +139,11 @@ class Surface(nn.Module):
         As at work seeds are thinned out, so that many lie in holes and beyond edges, and pushed on between rounds.
         """
         count = self.queries
+        if count > EACH * patch.shape[1]:
+            raise ValueError(
+                f"model.queries={count}: expected at most {EACH} times the points of a crop, found {patch.shape[1]}"
+                " points; raise data.size"
+            )
         discs = torch.stack([tangent_discs(p[:, :3], p[:, 3:], EACH, first=count) for p in patch])
         parents = patch[:, :count, None].expand(-1, -1, EACH, -1)
         seeds = torch.cat([discs, parents[..., 3:]], -1).flatten(1, 2)
