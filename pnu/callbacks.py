@@ -1,25 +1,30 @@
 """What happens beside the training steps: checkpoints, progress, pictures."""
 
+import itertools
 import math
 import time
 from collections.abc import Mapping
 from datetime import timedelta
+from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
 import numpy as np
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from omegaconf import OmegaConf
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch import Tensor
 from torch.utils.tensorboard.summary import hparams
 
 from pnu.checkpoint import read, write
 from pnu.ops.colors import normal_colors
 from pnu.pictures import figure, look_at, render_cloud, save_png
 from pnu.run import RunFolder, build
+from pnu.run.build import PACKAGES, find_class
 from pnu.run.folder import UNHASHED, UNHASHED_DATA
+from pnu.run.signature import arguments
 from pnu.runtime.progress import bar
 
 CLOUDS_3D = 4  # shapes in TensorBoard's 3D tab
@@ -39,10 +44,10 @@ class Checkpoints(pl.Callback):
     """Saves last.ckpt at intervals and at the end, and best.ckpt when a validation value is the smallest so far.
 
     Args:
-        run: whose checkpoints these are; its metrics.json gets the best validation.
-        every_n_steps: training steps between two last.ckpt; 0: only time counts.
-        every_minutes: minutes between two last.ckpt; 0: only steps count.
-        monitor: validation value.
+        run: whose checkpoints these are; its metrics.json gets the best validation
+        every_n_steps: training steps between two last.ckpt; 0: count time only
+        every_minutes: minutes between two last.ckpt; 0: count steps only
+        monitor: validation value that is best when smallest
     """
 
     def __init__(
@@ -74,7 +79,7 @@ class Checkpoints(pl.Callback):
             self.save_last(trainer)
 
     def on_validation_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
-        if trainer.state.fn != "fit":
+        if trainer.state.fn != "fit" or trainer.sanity_checking:
             return
         found = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("val/")}
         if self.monitor not in found:
@@ -115,6 +120,81 @@ def validation_follows(trainer: pl.Trainer) -> bool:
     return loop.epoch_loop._should_check_val_fx(loop._data_fetcher)
 
 
+def network(module: pl.LightningModule) -> torch.nn.Module:
+    """The network that a training trains."""
+    assert isinstance(module.model, torch.nn.Module)
+    return module.model
+
+
+class EMA(pl.Callback):
+    """Keeps an exponential moving average of the weights: validation, its pictures and best.ckpt are of the average.
+
+    last.ckpt has the weights as they are, to go on from, and the average beside them. Without validation there is no
+    best.ckpt, and the average is of no use.
+
+    Args:
+        decay: share of the average that stays at a step; at first less, (1 + step) / (10 + step)
+    """
+
+    def __init__(self, decay: float = 0.999) -> None:
+        if not 0 <= decay < 1:
+            raise ValueError(f"callbacks.ema.decay={decay}: expected a number from 0 to below 1")
+        self.decay = decay
+        self.average: dict[str, Tensor] = {}
+        self.step = 0
+        self.swapped = False
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"average": self.average, "step": self.step}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.average, self.step = dict(state_dict["average"]), int(state_dict["step"])
+
+    def on_train_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        now = network(module).state_dict()
+        self.average = {
+            name: self.average.get(name, value).detach().to(value, copy=True) for name, value in now.items()
+        }
+
+    def on_train_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, *_: Any) -> None:
+        if trainer.global_step == self.step:  # gradients are still being accumulated
+            return
+        self.step = trainer.global_step
+        decay = min(self.decay, (1 + self.step) / (10 + self.step))
+        for name, value in network(module).state_dict().items():
+            if value.is_floating_point():
+                self.average[name].lerp_(value, 1 - decay)
+            else:
+                self.average[name].copy_(value)
+
+    def on_validation_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if trainer.state.fn == "fit" and self.average:
+            self.swap(module)
+
+    def on_validation_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if self.swapped:
+            self.swap(module)
+
+    def on_save_checkpoint(self, trainer: pl.Trainer, module: pl.LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Training goes on from its own weights, also where last.ckpt is saved after a validation."""
+        if self.swapped:
+            self.swap(module)
+            checkpoint["state_dict"] = {name: value.clone() for name, value in module.state_dict().items()}
+            checkpoint["callbacks"][self.state_key] = {
+                "average": {name: value.clone() for name, value in self.average.items()},
+                "step": self.step,
+            }
+            self.swap(module)
+
+    def swap(self, module: pl.LightningModule) -> None:
+        """The weights for their average, and back."""
+        for name, value in network(module).state_dict().items():
+            kept = value.clone()
+            value.copy_(self.average[name])
+            self.average[name].copy_(kept)
+        self.swapped = not self.swapped
+
+
 class ProgressBar(pl.Callback):
     """One bar for the whole training: step, loss, validation and time left; a line at each validation where there is
     no terminal."""
@@ -151,7 +231,7 @@ class ProgressBar(pl.Callback):
             self.bar.update(self.task, completed=trainer.global_step, text=text)
 
     def on_validation_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
-        if trainer.state.fn != "fit" or not trainer.is_global_zero:
+        if trainer.state.fn != "fit" or trainer.sanity_checking or not trainer.is_global_zero:
             return
         self.validation = f"val CD {1e3 * float(trainer.callback_metrics['val/chamfer_sq']):.4g}e-3"
         if not self.bar.console.is_terminal:
@@ -179,12 +259,11 @@ class Pictures(pl.Callback):
     there and in the run folder, beside input and target.
 
     Args:
-        run: whose folder pictures/ gets the PNGs.
-        clouds: how many, each of another shape as far as there are as many; 0: none. TensorBoard's 3D tab, which loads
-            all it has, gets the first four.
-        points: of a 3D cloud at most.
-        every: validations from one picture to the next; the last one of a training is always drawn.
-        size: pixels of a panel's side.
+        run: whose folder pictures/ gets the PNGs
+        clouds: validation clouds, each of another shape as far as there are as many; 0: none; four at most in 3D
+        points: points of a cloud in TensorBoard's 3D view at most; more make the tab slow
+        every: validations from one picture to the next; the last one of a training is always drawn
+        size: pixels of a panel's side
     """
 
     def __init__(self, run: RunFolder, clouds: int = 4, points: int = 2048, every: int = 10, size: int = 320) -> None:
@@ -211,6 +290,8 @@ class Pictures(pl.Callback):
                 self.samples.append({"shape": shape, **cloud})
 
     def on_validation_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if trainer.sanity_checking:
+            return
         if self.seen % self.every == 0:
             self.draw(trainer, module)
         self.seen += 1
@@ -318,16 +399,40 @@ def unit(cloud: np.ndarray) -> np.ndarray:
     return cloud[:, 3:6] / np.maximum(np.linalg.norm(cloud[:, 3:6], axis=1, keepdims=True), 1e-12)
 
 
+KEEPERS = (Checkpoints, Pictures)
+
+
 def build_all(config: Mapping[str, Any], run: RunFolder) -> list[pl.Callback]:
-    """The callbacks of a training. Checkpoints come last: they save what the others have become."""
-    found: list[pl.Callback] = [Board(config)] if config["quiet"] else [Board(config), ProgressBar()]
-    for group in config["callbacks"].values():
-        ours = str(group.get("_target_")).startswith("pnu.")
-        found.append(build(group, "pnu.callbacks", run=run) if ours else build(group, "lightning.pytorch.callbacks"))
-    return sorted(found, key=lambda callback: isinstance(callback, Checkpoints))
+    """The callbacks of a training. Checkpoints save what the others have become, EMA then takes the average away again.
+
+    As Lightning's `fast_dev_run` writes neither checkpoints nor curves, ours keep nothing of it."""
+    trainer = config["trainer"]
+    progress = [] if config["quiet"] or trainer.get("enable_progress_bar") else [ProgressBar()]
+    found: list[pl.Callback] = [Board(config), *progress]
+    for group in (config["callbacks"] or {}).values():
+        if trainer.get("fast_dev_run") and find_class(group["_target_"], "pnu", ("lightning",)) in KEEPERS:
+            continue
+        own = {"run": run} if "run" in (arguments(str(group["_target_"])) or {}) else {}
+        found.append(build(group, PACKAGES["callbacks"], allow=config.get("allow") or (), **own))
+    return sorted(found, key=lambda callback: (isinstance(callback, EMA), isinstance(callback, Checkpoints)))
 
 
-def build_logger(config: Mapping[str, Any], run: RunFolder) -> Any:
-    """The logger, or False for none. What a run that goes on has logged after its last checkpoint is taken back."""
-    more = {"purge_step": read(run.last)["global_step"]} if run.last.exists() else {}
-    return build(config["logger"], "lightning.pytorch.loggers", save_dir=run.path, **more) or False
+def build_loggers(config: Mapping[str, Any], run: RunFolder) -> list[Logger]:
+    """The loggers of a training. What TensorBoard's has after a run's last checkpoint is taken back."""
+    groups = config["logger"] or {}
+    purge = {"purge_step": read(run.last)["global_step"]} if run.last.exists() else {}
+    found = []
+    for group in [groups] if "_target_" in groups else groups.values():  # runs of earlier versions have one, unnamed
+        kind = str(group["_target_"]).rpartition(".")[2]
+        more: dict[str, Any] = purge if kind == "TensorBoardLogger" else {}
+        if kind == "CSVLogger":  # which would write over what it has
+            group = {**group, "version": unused_name(run.path / (group.get("name") or ""), str(group.get("version")))}
+        folder = run.path.absolute() / "mlflow" if kind == "MLFlowLogger" else run.path
+        found.append(build(group, PACKAGES["logger"], allow=config.get("allow") or (), save_dir=str(folder), **more))
+    return found
+
+
+def unused_name(folder: Path, name: str) -> str:
+    """A name that nothing in a folder has: csv, csv_2, csv_3 ..."""
+    names = itertools.chain([name], (f"{name}_{i}" for i in itertools.count(2)))
+    return next(one for one in names if not (folder / one).exists())

@@ -13,7 +13,7 @@ import json
 import shutil
 import uuid
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -30,8 +30,11 @@ PREFIX = "model."
 NEWEST = "newest"  # instead of a run folder
 
 
-def load(source: str | PathLike[str]) -> nn.Module:
+def load(source: str | PathLike[str], allow: Sequence[str] = ()) -> nn.Module:
     """The trained network of a run folder, of a file of weights, or of that shipped name, on the CPU, in eval mode.
+
+    Args:
+        allow: packages of your own whose networks may be built too; they run their code. A run's own config has no say.
 
     "newest" is the run that finished last under outputs/. Generators and settings of torch are left alone, and have no
     influence.

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pnu.run import command, doc, find_metric
-from pnu.run.groups import Data
+from pnu.run import Group, command, doc, find_metric
 from pnu.run.provenance import provenance
 from pnu.run.quoting import quoted, typed_line
 from pnu.runtime.progress import steps
@@ -24,7 +23,7 @@ class Compare:
     methods: list[str] = doc(
         "run folders, folders of a sweep, and apss, poisson, midpoint; NAME:FOLDER gives a run another name"
     )
-    data: Data = doc(
+    data: Group = doc(
         "Shapes: procedural, or of data=meshes data.root=FOLDER, meshes or prepared pairs in clouds/ and truth/"
     )
     part: str | None = doc("of the shapes: train, val, test, all; null: test of the procedural ones, all of a folder")
@@ -125,9 +124,10 @@ def upsamplers(cfg: Any) -> dict[str, "Method"]:
             model, name = classical(folder), name or folder
         elif Path(folder).is_dir():
             own = run_name(folder)  # the time tells two runs of one name apart
-            model, name = checkpoint.load(folder), name or (own if names[own] < 2 else Path(folder).resolve().name)
+            name = name or (own if names[own] < 2 else Path(folder).resolve().name)
+            model = checkpoint.load(folder, cfg.allow)
         elif weights.find(folder):
-            model, name = checkpoint.load(folder), name or Path(folder).stem
+            model, name = checkpoint.load(folder, cfg.allow), name or Path(folder).stem
         else:
             known = ", ".join([*CLASSICAL, *weights.names()])
             raise ValueError(f"methods={method}: expected a run folder, or one of {known}; found neither")

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pnu.run import command, doc, find_metric, shell_line
-from pnu.run.groups import Data
+from pnu.run import Group, command, doc, find_metric, shell_line
 from pnu.run.provenance import provenance
 from pnu.runtime.progress import steps
 
@@ -25,7 +24,7 @@ class Evaluate:
         "run folder, or name or file of weights; newest: the run that finished last; null: `method`, or surface"
     )
     method: str | None = doc("upsampler without training instead of a run: apss, poisson or midpoint")
-    data: Data = doc(
+    data: Group = doc(
         "Shapes: procedural, or of data=meshes data.root=FOLDER, meshes or prepared pairs in clouds/ and truth/"
     )
     part: str | None = doc("of the shapes: train, val, test, all; null: test of the procedural ones, all of a folder")
@@ -64,7 +63,7 @@ def evaluate(cfg: Any) -> None:
         seed=cfg.seed, normals=cfg.normals == "given", warn=warn,
     )  # fmt: skip
     subject = cfg.method or str(checkpoint.resolve(cfg.run or DEFAULT[cfg.normals]))
-    model = classical(subject) if cfg.method else checkpoint.load(subject)
+    model = classical(subject) if cfg.method else checkpoint.load(subject, cfg.allow)
     upsampler = evaluation.network_upsampler(
         model, cfg.ratio, passes=cfg.passes, name=subject, patch_size=cfg.patch_size, batch_size=cfg.batch_size,
         device=cfg.device, seed=cfg.seed,

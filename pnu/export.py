@@ -13,6 +13,7 @@ class Export:
 
     run: str = doc("run folder")
     output: str = doc("file to write, NAME.safetensors")
+    allow: list[str] = doc("packages of your own whose networks a run may name; they run their code")
     quiet: bool = doc("print nothing but errors")
 
 
@@ -24,7 +25,7 @@ def export(cfg: Any) -> None:
 
     from pnu import checkpoint, weights
 
-    network = checkpoint.load(cfg.run)
+    network = checkpoint.load(cfg.run, cfg.allow)
     model = checkpoint.run_config(Path(cfg.run))["model"]
     weights.write(cfg.output, model, network.state_dict(), getattr(network, "patch_size", None))
     if not cfg.quiet:

@@ -6,13 +6,15 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
 import torch
 from lightning.pytorch.plugins.layer_sync import TorchSyncBatchNorm
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 
@@ -74,6 +76,15 @@ class SynchronizedNorms(TorchSyncBatchNorm):
 def norm_plugins(trainer: Mapping[str, Any]) -> list[SynchronizedNorms]:
     """What Lightning needs for the trainer's sync_batchnorm."""
     return [SynchronizedNorms()] if trainer.get("sync_batchnorm") else []
+
+
+@contextmanager
+def misconfigured() -> Iterator[None]:
+    """What Lightning says against a configuration, as a ValueError."""
+    try:
+        yield
+    except MisconfigurationException as error:
+        raise ValueError(f"trainer: {' '.join(str(error).split())}") from error
 
 
 class NonFinite(ValueError):

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pnu.run import build, command, doc, shell_line
-from pnu.run.groups import Data
+from pnu.run import Group, build, command, doc, shell_line
 
 BATCH = 20  # patches of a training step, as conf/data/patches.yaml has it
 
@@ -19,7 +18,7 @@ class Prepare:
     output: str | None = doc("also name the file so; null: only data.cache, where training finds it by its parameters")
     seed: int = doc("not used by the patches, see data.shape_seed")
     quiet: bool = doc("no progress bar, print the file's path alone")
-    data: Data = doc("Data")
+    data: Group = doc("Data")
 
 
 def prepare(cfg: Any) -> None:

@@ -4,8 +4,20 @@ import functools
 from dataclasses import dataclass
 from typing import Any
 
-from pnu.run import build, closing, command, doc, find_metric, is_main_process, job_line, objective, open_run
-from pnu.run.groups import Callbacks, Data, Logger, Loss, Model, Optimizer, Scheduler, Trainer
+from pnu.run import (
+    Group,
+    Groups,
+    build,
+    closing,
+    command,
+    doc,
+    find_metric,
+    is_main_process,
+    job_line,
+    objective,
+    open_run,
+)
+from pnu.run.build import PACKAGES
 from pnu.run.provenance import machine
 
 
@@ -22,16 +34,16 @@ class Train:
     quiet: bool = doc("print the run folder alone")
     sweep: str | None = doc("name of a sweep (-m) below outputs/sweeps; null: made of the command line")
     metrics: list[str] = doc("classes of metrics of your own, measured beside pnu's: [mylab.Roughness]")
-    allow: list[str] = doc("packages of your own whose classes may be named, such as [mylab]")
     objective: list[str] | None = doc("validation metrics that a search (hparams_search) makes small")
-    data: Data = doc("Data")
-    model: Model = doc("Network")
-    loss: Loss = doc("Loss")
-    optimizer: Optimizer = doc("Optimizer")
-    scheduler: Scheduler = doc("Learning rate, stepped after each training step")
-    trainer: Trainer = doc("Training, by Lightning's Trainer")
-    callbacks: Callbacks = doc("Beside the training")
-    logger: Logger = doc("Logger")
+    allow: list[str] = doc("packages of your own whose classes a config may name, as loss._target_=mylab.Laplacian")
+    data: Group = doc("Data")
+    model: Group = doc("Network")
+    loss: Group = doc("Loss")
+    optimizer: Group = doc("Optimizer")
+    scheduler: Group = doc("Learning rate, stepped after each training step")
+    trainer: Group = doc("Training, by Lightning's Trainer")
+    callbacks: Groups = doc("Beside the training")
+    logger: Groups = doc("Where curves go")
 
 
 def train(cfg: Any) -> list[float] | None:
@@ -52,26 +64,29 @@ def train(cfg: Any) -> list[float] | None:
         if config["threads"]:
             torch.set_num_threads(config["threads"])
         pl.seed_everything(config["seed"], verbose=False)
-        data = build(config["data"], "pnu.data")
-        model = networks.build(config["model"])
+        allow = config["allow"]
+        parts = {
+            group: build(config[group], PACKAGES[group], allow=allow)
+            for group in ("data", "loss", "optimizer", "scheduler")
+        }
+        model, data = networks.build(config["model"], allow), parts.pop("data")
         if source := config.get("weights"):
-            checkpoint.fill(model, checkpoint.load(source).state_dict(), source)
-        loss = build(config["loss"], "pnu.losses")
-        optimizer = build(config["optimizer"], "torch.optim")
-        scheduler = build(config["scheduler"], "torch.optim.lr_scheduler")
-        find = functools.partial(find_metric, allow=config.get("allow"))
+            checkpoint.fill(model, checkpoint.load(source, allow).state_dict(), source)
+        find = functools.partial(find_metric, allow=allow)
         chosen = metrics.with_own(config.get("metrics") or (), find)
         record["metrics"] = {m.shown.name: m.shown._asdict() for m in chosen if m not in metrics.METRICS}
-        module = lit.UpsamplingModule(model, loss, optimizer, scheduler, chosen)
-        trainer = build(
-            config["trainer"],
-            "lightning.pytorch",
-            callbacks=callbacks.build_all(config, run),
-            logger=callbacks.build_logger(config, run),
-            plugins=[callbacks.AtomicCheckpointIO(), *lit.norm_plugins(config["trainer"])],
-            default_root_dir=run.path,
-            **lit.TRAINER_OPTIONS,
-        )
+        module = lit.UpsamplingModule(model, **parts, metrics=chosen)
+        options: Any = {name: value for name, value in lit.TRAINER_OPTIONS.items() if name not in config["trainer"]}
+        with lit.misconfigured():
+            trainer = build(
+                config["trainer"],
+                PACKAGES["trainer"],
+                callbacks=callbacks.build_all(config, run),
+                logger=callbacks.build_loggers(config, run) or False,
+                plugins=[callbacks.AtomicCheckpointIO(), *lit.norm_plugins(config["trainer"])],
+                default_root_dir=run.path,
+                **options,
+            )
         record |= {"device": str(trainer.strategy.root_device), "machine": machine()}
         start = run.last if run.last.exists() else None
         if start is None:

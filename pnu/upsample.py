@@ -43,6 +43,7 @@ class Upsample:
     device: str = doc("auto, cpu, cuda, cuda:1 ...")
     devices: int = doc("CUDA devices, or processes on the CPU, that share the work; the result stays the same")
     seed: int = doc("of models that draw random numbers")
+    allow: list[str] = doc("packages of your own whose networks a run may name; they run their code")
     quiet: bool = doc("print nothing but errors")
 
 
@@ -67,7 +68,7 @@ def upsample(cfg: Any) -> None:
     for note in cloud.notes:
         say(f"        {note}")
 
-    from pnu import inference, weights
+    from pnu import checkpoint, inference, weights
     from pnu.checkpoint import NEWEST
     from pnu.ops.survey import survey
 
@@ -89,7 +90,7 @@ def upsample(cfg: Any) -> None:
             cloud.points,
             cloud.normals,
             ratio=cfg.ratio,
-            model=run,
+            model=checkpoint.load(run, cfg.allow) if cfg.allow else run,
             patch_size=cfg.patch_size,
             device=cfg.device,
             devices=cfg.devices,

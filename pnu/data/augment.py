@@ -17,12 +17,14 @@ class Augmentation:
     (for the rotation, False).
 
     Args:
-        rotation: turn by a uniform random rotation.
-        scale: lowest and highest factor.
-        shift: greatest offset along each axis.
-        jitter_sigma, jitter_clip: of the offset of each coordinate of each input point.
-        tilt_sigma, tilt_clip: of the three angles of the small rotation, in radians.
-        input_probability: of jitter, and of the small rotation.
+        rotation: turn input and target by a uniform random rotation
+        scale: lowest and highest factor of input and target
+        shift: greatest offset of input and target along each axis, of the unit sphere's radius
+        jitter_sigma: standard deviation of each coordinate of the input's points
+        jitter_clip: greatest offset by jitter
+        tilt_sigma: standard deviation of the angles of the input's small rotation, in radians
+        tilt_clip: greatest of those angles
+        input_probability: of jitter, and of the small rotation
     """
 
     def __init__(
@@ -76,6 +78,6 @@ class Augmentation:
         return rotate(cloud, tilt) if tilted else cloud
 
 
-def from_options(options: Mapping[str, Any] | None) -> Augmentation | None:
+def from_options(options: Augmentation | Mapping[str, Any] | None) -> Augmentation | None:
     """The augmentation of a config group; None for none."""
-    return None if options is None else Augmentation(**options)
+    return Augmentation(**options) if isinstance(options, Mapping) else options

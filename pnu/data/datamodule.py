@@ -13,7 +13,7 @@ import lightning.pytorch as pl
 from torch.utils.data import DataLoader, Dataset, Subset
 
 from pnu.data import shapes
-from pnu.data.augment import from_options
+from pnu.data.augment import Augmentation, from_options
 from pnu.data.dataset import Downsampling, EpochSampler, Options, PatchDataset, check_options, split
 from pnu.data.patchset import build, check, told_open
 from pnu.io import Mesh, meshes_of, read_mesh
@@ -106,12 +106,19 @@ class PatchDataModule(EpochDataModule):
     Batches depend on the seed alone, not on the number of workers. Training goes on mid-epoch where a checkpoint was.
 
     Args:
-        path: HDF5 file, see data/README.md.
-        batch_size, workers, seed: see `EpochDataModule`; the seed is of downsampling and augmentation too.
-        input_points, target_points, downsampling, strength, centers: see `pnu.data.dataset.Options`.
-        evaluation: downsampling of validation and test; None: the training's.
-        augmentation: arguments of `pnu.data.augment.Augmentation`; None: none.
-        val_share, test_share: of the shapes, kept for validation and test.
+        path: HDF5 file of patches, see data/README.md
+        batch_size: patches of a training step, on each device
+        workers: processes that load; 0: the training's own; the data are the same with any number
+        seed: of order, downsampling and augmentation
+        input_points: points of an input patch
+        target_points: points of a target patch; fewer than the file has take a smaller patch
+        downsampling: nonuniform (paper), random (released, but without replacement), poisson (evenly) or given (file)
+        evaluation: downsampling of validation and test; null: the training's
+        strength: nonuniform: centres are exp(strength) times denser than the farthest points; 0: uniform
+        centers: nonuniform: dense places of a patch
+        augmentation: random changes of training samples; a part with range or sigma 0 is off; null: none at all
+        val_share: share of the shapes kept for validation
+        test_share: share of the shapes kept for the test
     """
 
     kind = "patches"
@@ -129,7 +136,7 @@ class PatchDataModule(EpochDataModule):
         evaluation: Downsampling | None = None,
         strength: float = 2.0,
         centers: int = 3,
-        augmentation: Mapping[str, Any] | None = None,
+        augmentation: Augmentation | Mapping[str, Any] | None = None,
         val_share: float = 0.1,
         test_share: float = 0.1,
     ) -> None:
@@ -179,9 +186,10 @@ class GeneratedDataModule(PatchDataModule):
     """Patches that are cut from meshes once and kept in a file, whose name holds a hash of all that it depends on.
 
     Args:
-        patches: of all shapes together, training, validation and test.
-        cache: folder of the file.
-        shape_seed: of the patches' places and points.
+        patches: cut from all shapes together, for training, validation and test
+        cache: folder of the files of patches that are cut
+        shape_seed: of where patches are cut and of their points
+        quiet: no progress bar while patches are cut
         options: as for `PatchDataModule`.
     """
 
@@ -232,7 +240,7 @@ class SyntheticDataModule(GeneratedDataModule):
     """Patches of the procedural shapes that come with pnu: python -m pnu.train data=synthetic.
 
     Args:
-        kinds: of shapes, "organic" and "cad".
+        kinds: of procedural shapes: organic, cad
         options: as for `GeneratedDataModule` and `PatchDataModule`.
     """
 
@@ -251,7 +259,7 @@ class MeshDataModule(GeneratedDataModule):
     """Patches of a folder of meshes (ply, off, obj, stl, glb, gltf, vtk, vtp): data=meshes data.root=FOLDER.
 
     Args:
-        root: the folder; its subfolders count too.
+        root: folder of meshes: ply, off, obj, stl, glb, gltf, vtk, vtp; its subfolders count too
         options: as for `GeneratedDataModule` and `PatchDataModule`.
     """
 

@@ -1,6 +1,7 @@
 """Data module of the surface model: crops for training, whole clouds of other shapes for validation and test."""
 
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, Literal
 
 from pnu.data import shapes
 from pnu.data.crops import SMALLEST, Crops, WholeClouds, flattened, stacked
@@ -14,25 +15,26 @@ class ProjectionDataModule(EpochDataModule):
     """Crops of clouds drawn from meshes.
 
     Args:
-        root: folder of closed meshes, added to the procedural shapes; None: those alone.
-        procedural: train on the procedural shapes.
-        validation: names of the meshes kept for validation and test.
-        normals: "given" or "estimated", see `Crops`.
-        clouds: of an epoch, each drawn anew.
-        size: points of a crop.
-        views: crops of a cloud.
-        batch_size: clouds of a batch.
-        points: of a validation cloud.
-        workers: processes that draw crops.
-        seed: of all draws.
+        root: folder of closed meshes, beside the procedural shapes; null: those alone
+        procedural: train on the procedural shapes
+        validation: names of the meshes kept for validation and test
+        normals: of the input: given, or estimated from its points
+        clouds: of an epoch, each drawn anew
+        size: points of a crop
+        views: crops of a cloud
+        batch_size: clouds of a batch, on each device
+        points: points of a validation cloud
+        workers: processes that draw crops; 0: the training's own
+        seed: of all draws
     """
 
     kind = "clouds"
     collate, collate_evaluation = staticmethod(flattened), staticmethod(stacked)
 
     def __init__(
-        self, root: str | None, procedural: bool, validation: list[str], normals: str, clouds: int, size: int,
-        views: int, batch_size: int, points: int, workers: int, seed: int,
+        self, root: str | None = None, procedural: bool = True, validation: Iterable[str] = (),
+        normals: Literal["given", "estimated"] = "given", clouds: int = 6400, size: int = 384, views: int = 2,
+        batch_size: int = 8, points: int = 2048, workers: int = 0, seed: int = 0,
     ) -> None:  # fmt: skip
         super().__init__(batch_size, workers, seed)
         if points < SMALLEST:

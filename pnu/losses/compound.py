@@ -136,17 +136,19 @@ class CompoundLoss(nn.Module):
     its weight.
 
     Args:
-        w1, w2, w3, w4, w5: weights of the terms.
-        k: neighbours of the three neighbourhood terms.
-        reduction: "mean" over points and neighbours (released), or "sum" over them (the paper's equations).
-        point_term: what w1 weighs: "chamfer", or "emd", which the paper defines and finds too expensive. "cd" is
-            reported in both cases.
-        point_knn_in: where point_knn takes neighbours: "prediction" (released; the paper's text and Fig. 3) or
-            "target" (its formula).
-        normal_pairs: "target", each target with its nearest prediction (released), or "prediction", the other way.
-        orth: "absolute" cosine (released) or "signed" (the paper's formula).
-        unit_normals: normalise predicted normals first; the released code does not.
-        near_ties: of the nearest prediction, by "released" rounding (see `search`) or "exact".
+        w1: weight of the point term: Chamfer distance (Eq. 1), or EMD (Eq. 2)
+        w2: weight of point_knn: neighbours close (Eq. 3)
+        w3: weight of normal: predicted against true normals (Eq. 4)
+        w4: weight of normal_orth: normals orthogonal to the surface (Eq. 5)
+        w5: weight of normal_knn: normals of neighbours alike (Eq. 6)
+        k: neighbours of the three neighbourhood terms
+        reduction: mean over points and neighbours (released code), or sum over them (the paper's equations)
+        point_term: what w1 weighs: chamfer, or emd (the paper defines it; many times slower); cd is reported too
+        point_knn_in: where its neighbours are: prediction (released code; the paper's text, Fig. 3) or target (Eq. 3)
+        normal_pairs: target: each with its nearest prediction (released code); prediction: the other way
+        orth: cosine of normal_orth: absolute (released code) or signed (Eq. 5)
+        unit_normals: normalise predicted normals before the loss; the released code does not
+        near_ties: of the nearest prediction: released (its rounding decides) or exact
     """
 
     def __init__(

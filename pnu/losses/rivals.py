@@ -28,11 +28,10 @@ class RepulsionLoss(nn.Module):
     w(r) = exp(-r^2 / h), so it is negative and grows in magnitude where close neighbours move apart.
 
     Args:
-        point_term: "chamfer" or "emd", the paper's reconstruction loss (earth mover's distance, slower).
-        w_repulsion: the paper's alpha.
-        h: squared reach of the repulsion in a patch of 4096 target points, in squared units of the patch; for n it is
-            h 4096 / n.
-        k: neighbours that repel a point.
+        point_term: chamfer, or emd (the paper's earth mover's distance; many times slower)
+        w_repulsion: weight of the repulsion, the paper's alpha
+        h: squared reach of the repulsion, in the unit sphere, for 4096 target points; for n it is h 4096 / n
+        k: neighbours that repel a point
     """
 
     def __init__(self, point_term: Literal["chamfer", "emd"] = "chamfer", w_repulsion: float = 0.01, h: float = 5e-4,
@@ -72,6 +71,15 @@ class EdgeAwareLoss(nn.Module):
     Reads from `extra`: "edge_distance" (B, m), which the network regresses, and "edges" (B, e, 3), points on the
     sharp edges of the target, rows of NaN where there are fewer than e. Distances and weights are in the units of the
     patch's unit sphere; the defaults of the weights are ours.
+
+    Args:
+        w_repulsion: weight of the repulsion
+        w_edge: weight of the distance of edge points to the edges
+        w_edge_distance: weight of the regressed distance to the nearest edge
+        h: reach of the repulsion, in the unit sphere, for 4096 target points; for n it is h sqrt(4096 / n)
+        k: neighbours that repel a point
+        near: regressed distance below which a point belongs to an edge
+        reach: distances to edges are truncated there
     """
 
     def __init__(
@@ -141,6 +149,11 @@ class ParameterizationLoss(nn.Module):
     Normals count without their sign, min(|a - b|^2, |a + b|^2): coarse ones of the input points against the nearest
     target's, refined ones of each prediction against its nearest target's. Reads "coarse_normal" (B, n', 3) and
     "input" (B, n', 3+) from `extra`.
+
+    Args:
+        w_cd: weight of the Chamfer distance
+        w_coarse: weight of the coarse normals
+        w_normal: weight of the refined normals
     """
 
     def __init__(self, w_cd: float = 100.0, w_coarse: float = 1.0, w_normal: float = 1.0) -> None:

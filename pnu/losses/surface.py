@@ -17,9 +17,14 @@ class SurfaceLoss(nn.Module):
     weight w_drift, which keeps a seed at its place; "normal", length of the difference of unit normals, w_normal;
     "calibration" of the predicted logarithm of the distance (Laplace), w_error. Queries whose closest surface looks
     away from their rough normal, as on the far side of a thin sheet, do not count.
+
+    Args:
+        w_drift: weight of the way from the surface point closest to the seed
+        w_normal: weight of predicted against true normals
+        w_error: weight of predicted against true distance
     """
 
-    def __init__(self, w_drift: float = 0.2, w_normal: float = 0.1, w_error: float = 0.01) -> None:
+    def __init__(self, w_drift: float = 0.5, w_normal: float = 0.1, w_error: float = 0.01) -> None:
         super().__init__()
         self.weights = {"distance": 1.0, "drift": w_drift, "normal": w_normal, "calibration": w_error}
 

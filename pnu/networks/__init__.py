@@ -4,36 +4,45 @@ A network maps patches (B, n, 6) to (B, ratio n, 6). `pnu.fast` computes the sam
 """
 
 import importlib
-import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torch import nn
 
+from pnu.run.build import is_within, present_name
 
-def build(config: Mapping[str, Any]) -> nn.Module:
+
+def build(config: Mapping[str, Any], allow: Sequence[str] = ()) -> nn.Module:
     """Build a network from a plain config: `_target_` names its class, the other keys are its arguments.
 
-    Only classes below `pnu.networks` are built, so that a config from elsewhere cannot run other code.
+    Only classes below `pnu.networks`, and of the packages `allow`, are built: a config from elsewhere runs no other
+    code.
 
     Raises:
-        ValueError: `_target_` is missing, lies outside `pnu.networks`, or does not accept the arguments.
+        ValueError: `_target_` is missing, lies outside these packages, or does not accept the arguments.
     """
     arguments = {str(key): value for key, value in config.items()}
-    target = str(arguments.pop("_target_", ""))
-    target = re.sub(r"^pnu\.models\.", "pnu.networks.", target)  # as older runs and weights have it
+    target = present_name(str(arguments.pop("_target_", "")))
     module_name, _, class_name = target.rpartition(".")
-    if not target.startswith("pnu.networks."):
+    packages = ("pnu.networks", *allow)
+    if not any(is_within(target, package) for package in packages):
+        own = target.partition(".")[0]
         raise ValueError(
-            f"model._target_: expected a class below pnu.networks, such as pnu.networks.pnu.PNU, got {target!r}"
+            f"model._target_: expected a class below {' or '.join(packages)}, such as pnu.networks.pnu.PNU, got"
+            f" {target!r}; if you trust the package, allow=[{own}] runs its code"
         )
     try:
         cls = getattr(importlib.import_module(module_name), class_name, None)
     except ModuleNotFoundError:
         cls = None
-    if not (isinstance(cls, type) and issubclass(cls, nn.Module) and cls.__module__ == module_name):
+    if not (isinstance(cls, type) and issubclass(cls, nn.Module) and is_defined(cls, packages)):
         raise ValueError(f"model._target_: {target!r} is no network of this version, such as pnu.networks.pnu.PNU")
     try:
         return cls(**arguments)
     except TypeError as error:
         raise ValueError(f"model: {class_name} does not accept these arguments: {error}") from error
+
+
+def is_defined(cls: type, packages: Sequence[str]) -> bool:
+    """Whether one of the packages defines the class, which others may only have imported."""
+    return any(is_within(cls.__module__, package) for package in packages)

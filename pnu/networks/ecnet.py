@@ -13,7 +13,7 @@ class ECNet(nn.Module):
     patch's units, for the edge-aware loss (`pnu.losses.EdgeAwareLoss`).
 
     Args:
-        ratio: points predicted for each input point, at least 2.
+        ratio: points out for each point in: 2 or more
 
     Source: Yu, Li, Fu, Cohen-Or, Heng, "EC-Net: an Edge-aware Point set Consolidation Network", ECCV 2018, section 3.2:
     expanded features give edge distances by two fully connected layers, and from the features with these distances

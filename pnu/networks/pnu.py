@@ -57,12 +57,12 @@ class PNU(nn.Module):
     Patches hold points in the unit sphere and their unit normals; predicted normals are not normalised.
 
     Args:
-        ratio: points predicted for each input point: 2, 4, 8 or 16.
-        input_normals: read the normals of the patch; without, they are ignored and may be missing.
-        predict_normals: predict normals beside points; without, the output has 3 columns.
-        local_features: PointNet++ features of each point (256).
-        global_features: PointNet features of the patch (512).
-        residual: predict what is added to the input point and normal; ours. Neither paper nor code has it.
+        ratio: points out for each point in: 2, 4, 8 or 16
+        input_normals: read the normals of the patch; without, they are ignored and may be missing
+        predict_normals: predict normals beside points; without, the output has 3 columns
+        local_features: PointNet++ features of each point's neighbourhood (256)
+        global_features: PointNet features of the whole patch (512)
+        residual: predict what is added to the input point and normal; ours, neither the paper's nor its code's
 
     Source: Sharma et al., "Point Cloud Upsampling and Normal Estimation using Deep Learning for Robust Surface
     Reconstruction", and its released code, which takes PointNet++ for the local features of Fig. 1.

@@ -42,7 +42,7 @@ class PUGeo(nn.Module):
     `outputs` adds "coarse_normal" (B, n, 3), of the input points, for `pnu.losses.ParameterizationLoss`.
 
     Args:
-        ratio: points predicted for each input point, at least 2.
+        ratio: points out for each point in: 2 or more
 
     Source: Qian, Hou, Kwong, He, "PUGeo-Net: A Geometry-centric Network for 3D Point Cloud Upsampling", ECCV 2020.
     Neighbours are those in space, searched once (the paper's extractor searches again in feature space).

@@ -59,7 +59,7 @@ class PUNet(nn.Module):
     """Patches (B, n, 3 or 6) -> (B, ratio n, 3), n >= 64; normals of the input are not read, none are predicted.
 
     Args:
-        ratio: points predicted for each input point, at least 2.
+        ratio: points out for each point in: 2 or more
 
     Source: Yu, Li, Fu, Cohen-Or, Heng, "PU-Net: Point Cloud Upsampling Network", CVPR 2018. Batch norm is ours in
     every layer, as in the other networks here, so that all train with the same schedule.

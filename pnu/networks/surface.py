@@ -75,21 +75,20 @@ class Surface(nn.Module):
     How its upsampler (`procedure`) works with it is kept here, as what was found best for these weights.
 
     Args:
-        ratio: points out for each point in, where none is asked for.
-        neighbours: input points that a seed looks at.
-        reach: rank of the farthest of them; beyond the 16 nearest they are thinned out evenly.
-        width: of the network.
-        rounds: projections in training; at work there are 1 + `refinements`.
-        seeds: seeds for each point wanted.
-        candidates: of them, after thinning out to an even spacing; each moves to a sphere.
-        shortlist: of those, thinned out again; the network projects these, and farthest points of them stay.
-        relaxation: steps of even spacing.
-        refinements: projections after it; one more is nearer to the surface and a little less even.
-        reject: share of the points that is made too many; the worst of
-            their surroundings by expected error are dropped in the end.
-        queries: seeds of a crop, in training.
-        sphere: start from the sphere that fits the neighbours (algebraic point set surface), not from the seed.
-        attention: weigh the neighbours; without it all count alike.
+        ratio: points out for each point in, where a command asks for none
+        neighbours: input points that a seed looks at
+        reach: rank of the farthest of them; beyond the 16 nearest they are thinned out evenly
+        width: of the network
+        rounds: projections in training; at work there are 1 + refinements
+        seeds: seeds for each point wanted
+        candidates: of them, after thinning out to even spacing; each moves to a sphere
+        shortlist: of those, thinned out again after they moved; the network projects these, the farthest stay
+        relaxation: steps of even spacing; 0: none
+        refinements: projections after the even spacing; one more is nearer to the surface and a little less even
+        reject: share of points made too many; the worst of their surroundings by expected error are dropped
+        queries: seeds of a crop, in training
+        sphere: start from the sphere that fits the neighbours (algebraic point set surface), not from the seed
+        attention: weigh the neighbours; without it all count alike
     """
 
     predicts_normals = True

@@ -28,7 +28,7 @@ with `conf/upsample.yaml`:
 The function gets the config resolved and checked against the dataclass, as a DictConfig (`cfg.ratio`). A `ValueError`
 or `OSError` that it raises becomes one line on stderr and exit code 2; so does any key, value or choice that the
 dataclass and conf/ do not know, also in a multirun, before the function is called. `HYDRA_FULL_ERROR=1` shows
-tracebacks. A field of dataclass type is a group: the keys that any of `conf/<group>/*.yaml` may have.
+tracebacks. A field of type `Group` is a group of conf/: its keys are the arguments of the class that `_target_` names.
 """
 
 from pnu.run.build import build, find_metric
@@ -37,10 +37,12 @@ from pnu.run.config import compose_config
 from pnu.run.folder import RunFolder, is_main_process
 from pnu.run.quoting import shell_line
 from pnu.run.resume import open_run
-from pnu.run.schema import doc
+from pnu.run.schema import Group, Groups, doc
 from pnu.run.table import closing, job_line, objective
 
 __all__ = [
+    "Group",
+    "Groups",
     "RunFolder",
     "build",
     "closing",

@@ -11,7 +11,19 @@ from typing import Any
 
 from pnu import __version__
 from pnu.run import quoting, search, sweep
-from pnu.run.config import check_keys, check_single, composer, config_folder, in_multirun, one_line, variations
+from pnu.run.config import (
+    check_keys,
+    check_single,
+    checked,
+    composer,
+    config_folder,
+    fitted,
+    in_multirun,
+    one_line,
+    said,
+    spell,
+    variations,
+)
 from pnu.run.folder import INTERRUPTED, is_main_process
 from pnu.run.help import help_text
 from pnu.run.schema import check, fields
@@ -30,7 +42,13 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
 
     @functools.wraps(function)
     def task(cfg: Any) -> Any:
+        from hydra.core.hydra_config import HydraConfig
+
+        hydra = HydraConfig.get()
         try:
+            cfg, left = fitted(cfg, hydra, schema, hydra.overrides.task)
+            if left and not cfg.get("quiet"):
+                print(said(left, hydra.runtime.choices), file=sys.stderr)
             return function(check(cfg, schema))
         except Exception as error:
             expected = isinstance(error, ValueError | OSError)
@@ -61,7 +79,9 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
         try:
             with composer(name, parsed.config_dir) as compose:
                 if parsed.help:
-                    print(help_text(schema, quoting.program(name), check(compose(overrides), schema, complete=False)))
+                    spelled = spell(overrides, schema, compose)
+                    text = help_text(schema, quoting.program(name), checked(spelled, schema, compose, complete=False))
+                    print(text)
                     return
                 if not parsed.multirun:
                     check_single(overrides)
@@ -70,13 +90,16 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
                     arguments += added
                     parsed.overrides += added
                     overrides += [o for o in added if not o.startswith("hydra.")]
+                respelled = dict(zip(overrides, spell(overrides, schema, compose), strict=True))
+                overrides = list(respelled.values())
+                arguments = [respelled.get(argument, argument) for argument in arguments]
                 check_keys(next(variations(overrides)), schema, compose)  # before the config itself adds to the sweep
                 swept = sweep.parameters(overrides, compose) if parsed.multirun else []
                 for one in variations([*swept, *overrides]):
                     check_keys(one, schema, compose)
                     if parsed.cfg:
                         continue
-                    config = check(compose(one), schema)
+                    config = checked(one, schema, compose)
                     if goes_on:
                         sweep.check_job(config)
                 if goes_on:
@@ -116,6 +139,13 @@ def folder_arguments(config: Any, schema: type) -> list[str]:
         ValueError: `run` names another folder, or the command makes none.
     """
     given, changes = config.hydra.run.dir, config.hydra.job.chdir
+    if changes and given == "." and "trainer" in fields(schema):
+        if config.run is None:
+            raise ValueError(
+                "hydra.job.chdir=true: a run folder is named when it is made; hydra.run.dir=FOLDER names it"
+            )
+        path = Path(config.run).absolute()
+        return [quoting.override("hydra.run.dir", path), quoting.override("run", path)]
     if given == "." or not is_main_process():  # Lightning gives the other processes of a training one of their own
         return []
     if "trainer" not in fields(schema):

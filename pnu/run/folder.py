@@ -39,6 +39,7 @@ class RunFolder:
         self.pictures = self.path / "pictures"
         self.record_path = self.path / "run.json"
         self.facts: dict[str, Any] = {}  # more that run.json shall tell
+        self.allow: list[str] = []  # packages whose classes its config names
         self.skip = ""  # why nothing is to be done
         self.lock: int | None = None  # descriptor of a lock, closed when the run ends
 
@@ -77,6 +78,11 @@ class RunFolder:
         if left:
             names = ", ".join(path.name for path in left)
             print(f"{self}: no checkpoint to go on from, starts anew; removed what was left: {names}", file=sys.stderr)
+
+    def line(self, verb: str, **keys: Any) -> str:
+        """The command line of a command on this run."""
+        allow = {"allow": f"[{','.join(self.allow)}]"} if self.allow else {}
+        return shell_line(verb, **keys, run=self, **allow)
 
     @classmethod
     def existing(cls, path: str | Path | None) -> "RunFolder":
@@ -118,6 +124,7 @@ class RunFolder:
             yield {}
             return
         before = self.read_record()
+        self.allow = list(config.get("allow") or [])
         record = {
             "status": "running",
             "command": typed_line(),
@@ -141,7 +148,7 @@ class RunFolder:
         except (KeyboardInterrupt, SystemExit):  # Lightning turns the first into the second
             record |= {"status": "failed", "error": "interrupted"}
             if "job" not in self.facts:  # a sweep tells at its end
-                print(f"stopped; go on with: {shell_line('train', resume=True, run=self)}", file=sys.stderr)
+                print(f"stopped; go on with: {self.line('train', resume=True)}", file=sys.stderr)
             sys.exit(INTERRUPTED)
         except BaseException as error:
             record |= {"status": "failed", "error": f"{type(error).__name__}: {' '.join(str(error).split())}"}

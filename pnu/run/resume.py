@@ -18,6 +18,7 @@ FREE = (
     "run",
     "resume",
     "quiet",
+    "allow",
     "data.workers",
     "trainer.max_epochs",
     "trainer.max_steps",
@@ -94,20 +95,22 @@ def restored(run: RunFolder, config: dict[str, Any], overrides: Sequence[str], s
     from yaml import YAMLError
 
     try:
-        written = OmegaConf.load(run.config)
+        written: Any = OmegaConf.load(run.config)
         if "${" in json.dumps(OmegaConf.to_container(written), default=str):  # it could ask for ${oc.env:SECRET}
             raise ValueError(f"{run.config}: expected plain values, found ${{...}}; write out what it stands for")
+        if "allow" in config:  # whose code may run is said anew, never by a folder
+            written["allow"] = config["allow"]
         saved = check(written, schema)
     except (OmegaConfBaseException, YAMLError, AttributeError, TypeError, RecursionError) as error:
         raise ValueError(f"{run.config}: expected the config of a run, found {' '.join(str(error).split())}") from None
     for key in config.keys() - saved.keys():  # of a later version than the run's
         OmegaConf.update(saved, key, config[key], force_add=True)
-    known = set(shlex.split(str(run.read_record().get("command", ""))))
+    known = {argument.lstrip("+") for argument in shlex.split(str(run.read_record().get("command", "")))}
     values = flatten(config)
     for override in overrides:
         key = override.partition("=")[0].lstrip("+~")
         if key in FREE:
             OmegaConf.update(saved, key, values[key], force_add=True)
-        elif override not in known:  # repeating the command that started the run does no harm
+        elif override.lstrip("+") not in known:  # repeating the command that started the run does no harm
             raise ValueError(f"{override}: a run that goes on keeps its config; what may change: {', '.join(FREE)}")
     return OmegaConf.to_container(saved)  # type: ignore[return-value]

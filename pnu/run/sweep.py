@@ -103,7 +103,7 @@ def label_of(overrides: str) -> str:
     wants quotes."""
     parts = []
     for part in filter(None, overrides.split(",")):
-        key, _, value = part.partition("=")
+        key, _, value = part.lstrip("+").partition("=")
         try:
             value = f"{float(value):.4g}"
         except ValueError:

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Any
 
 from pnu.io import read_json
 from pnu.run.folder import RunFolder
-from pnu.run.quoting import shell_line
 
 if TYPE_CHECKING:
     from pnu.metrics import Shown
@@ -71,5 +70,8 @@ def closing(run: RunFolder) -> str:
         others = " and ".join(TITLES[name] for name in columns if name != "test")
         chosen = ", with the network of the best validation" * ("validation" in columns)
         lines.append(f"{others}: on the validation's shapes; test: on other shapes{chosen}")
-    upsample = shell_line("upsample", input="cloud.ply", output="dense.ply", run=run)
+    if not run.last.exists():
+        kept = "no checkpoint was kept: trainer.fast_dev_run, or no callbacks.checkpoints"
+        return "\n".join(["", *lines, "", f"run folder: {run}", kept])
+    upsample = run.line("upsample", input="cloud.ply", output="dense.ply")
     return "\n".join(["", *lines, "", f"run folder: {run}", f"next: {upsample}"])
