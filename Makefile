@@ -18,7 +18,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo 'Python lacks venv; on Debian: apt-get install python3-venv'; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
-	@$(BIN)/python -m pnu.doctor --install
+	@$(BIN)/pnu doctor --install
 	@touch $@
 
 setup: $(STAMP)   ## virtual environment in .venv, pinned packages, pnu itself, system libraries
@@ -42,10 +42,10 @@ train: $(STAMP)   ## train the paper's network on embedded data: a small success
 
 sweep: $(STAMP)   ## a small ablation and its report in minutes: make sweep ABLATION=loss_terms
 	$(BIN)/python -m pnu.train -m ablation=$(ABLATION) scale=small hydra/launcher=joblib hydra.launcher.n_jobs=2 $(ARGS)
-	$(BIN)/python -m pnu.report
+	$(BIN)/pnu report
 
 board: $(STAMP)   ## TensorBoard over outputs/
-	@$(BIN)/python -m pnu.doctor --require
+	@$(BIN)/pnu doctor --require
 	$(BIN)/tensorboard --logdir outputs $(ARGS)
 
 bench: $(STAMP)   ## measure speed, as ratios to named alternatives

@@ -17,7 +17,7 @@ import torch
 from bench import inference, ops, scale, step
 from bench.timing import Row
 from pnu.io import atomic_path, write_json
-from pnu.run.provenance import provenance
+from pnu.runtime.provenance import provenance
 
 PARTS: dict[str, Callable[[], Iterable[Row]]] = {
     "ops": ops.rows,

@@ -7,8 +7,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from pnu.geometry.cloud_statistics import survey
 from pnu.io import CLOUD_SUFFIXES, Cloud, files_of, read_cloud
-from pnu.ops.survey import survey
 
 
 def contents(cloud: Cloud) -> str:

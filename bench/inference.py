@@ -14,10 +14,10 @@ from bench.ops import full_matrix, plain_farthest_points
 from bench.plain import PlainPNU
 from bench.scale import wavy_sphere
 from bench.timing import Row, compare
-from pnu.inference import upsample
 from pnu.io import write_cloud, write_json
 from pnu.networks.pnu import PNU
 from pnu.networks.released import from_released
+from pnu.upsamplers.whole_clouds import upsample
 
 POINTS, RATIO, PATCH = 5000, 4, 1024
 SHARED = 10_000  # points of a cloud that processes share
@@ -91,14 +91,14 @@ def rows() -> Iterator[Row]:
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "cloud.ply", Path(folder) / "dense.ply"
         write_cloud(source, points, normals)
-        command = [sys.executable, "-m", "pnu.upsample", f"input={source}", f"output={target}", "quiet=true"]
+        command = [sys.executable, "-m", "pnu", "upsample", f"input={source}", f"output={target}", "quiet=true"]
         alone = [sys.executable, "-c", "import torch"]
         run = partial(subprocess.run, check=True, capture_output=True)
         for name, weights in (("network pnu", as_run(ours, Path(folder) / "run")), ("surface", "surface")):
             yield compare(
                 f"whole command {size}, {name}",
                 {
-                    "python -m pnu.upsample": partial(run, [*command, f"run={weights}"]),
+                    "pnu upsample": partial(run, [*command, f"run={weights}"]),
                     "import torch": partial(run, alone),
                 },
                 rounds=3,

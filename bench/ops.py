@@ -6,8 +6,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bench.timing import Row, compare
-from pnu.ops.nearest import ball_query, knn, nearest
-from pnu.ops.sampling import farthest_points
+from pnu.geometry.neighbor_search import ball_query, knn, nearest
+from pnu.geometry.sampling import farthest_points
 
 CLOUDS, POINTS = 20, 4096
 

@@ -16,17 +16,18 @@ import numpy as np
 import torch
 from torch import nn
 
-from pnu import checkpoint, metrics, surfaces
-from pnu.evaluation import Case, Row, columns, source, summarize
-from pnu.evaluation.cases import generator
-from pnu.evaluation.report import cell
-from pnu.inference import upsample
+from pnu import metrics, reconstruction
+from pnu.benchmark import Case, Row, columns, source, summarize
+from pnu.benchmark.cases import generator
+from pnu.benchmark.result_tables import cell
+from pnu.geometry.mesh_topology import vertex_normals
+from pnu.geometry.normal_estimation import estimate_normals
 from pnu.io import atomic_path, read_json, write_cloud, write_json, write_mesh
-from pnu.metrics.raycast import closest_points
-from pnu.ops.mesh import vertex_normals
-from pnu.ops.normals import estimate_normals
-from pnu.run.provenance import provenance
+from pnu.metrics.ray_casting import closest_points
+from pnu.networks import checkpoints
+from pnu.runtime.provenance import provenance
 from pnu.upsamplers import CLASSICAL, Upsampler, classical
+from pnu.upsamplers.whole_clouds import upsample
 
 
 class Setting(NamedTuple):
@@ -84,7 +85,7 @@ def network(method: str, setting: Setting) -> nn.Module | Upsampler:
     """A classical method, or weights or a run; "surface" takes the weights for the normals of the setting."""
     if method in CLASSICAL:
         return classical(method)
-    return checkpoint.load("surface_estimated" if method == "surface" and not setting.given else method)
+    return checkpoints.load("surface_estimated" if method == "surface" and not setting.given else method)
 
 
 def clouds(cases: list[Case], setting: Setting, methods: list[str], seed: int, folder: Path) -> Iterator[Row]:
@@ -116,8 +117,8 @@ def poisson(cases: list[Case], setting: Setting, methods: list[str], seed: int, 
                     case.points, case.normals, ratio=setting.ratio, model=network(method, setting), seed=seed
                 )
         for method, cloud in found.items():
-            mesh = surfaces.reconstruct(cloud[:, :3], cloud[:, 3:], name=case.truth.shape).mesh
-            errors = surfaces.surface_errors(mesh, case.truth.mesh, rng=np.random.default_rng(seed))
+            mesh = reconstruction.reconstruct(cloud[:, :3], cloud[:, 3:], name=case.truth.shape).mesh
+            errors = reconstruction.surface_errors(mesh, case.truth.mesh, rng=np.random.default_rng(seed))
             (folder / method).mkdir(parents=True, exist_ok=True)
             write_mesh(
                 folder / method / f"{case.truth.shape}_surface.ply", mesh, vertex_normals=vertex_normals(mesh),

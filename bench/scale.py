@@ -21,7 +21,7 @@ RUN = """
 import json, re, sys, time
 from pathlib import Path
 from bench.scale import network, wavy_sphere
-from pnu.inference import upsample
+from pnu.upsamplers.whole_clouds import upsample
 from pnu.io import write_cloud
 n, name, kept = int(sys.argv[1]), sys.argv[2], sys.argv[3]
 cloud, model = wavy_sphere(n), network(name)

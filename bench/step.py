@@ -27,13 +27,13 @@ import pnu.networks.pnu
 from bench.plain import PlainLoss, PlainPNU
 from bench.timing import Row, compare
 from pnu.data import shapes
-from pnu.data.datamodule import PatchDataModule
+from pnu.data.patch_module import PatchDataModule
 from pnu.fast import accelerate
+from pnu.geometry import mesh_sampling, patch_extraction
+from pnu.geometry.unit_sphere import unit_sphere_frame
 from pnu.losses import CompoundLoss
 from pnu.networks.pnu import PNU
 from pnu.networks.released import from_released
-from pnu.ops import patches, surface
-from pnu.ops.normalize import unit_sphere_frame
 
 CLOUDS, POINTS, RATIO = 20, 1024, 4
 SIZE = f"{CLOUDS} x {POINTS} -> {POINTS * RATIO}"
@@ -60,8 +60,8 @@ def data() -> tuple[Tensor, Tensor]:
     generator = np.random.default_rng(0)
     targets = []
     for name in shapes.names()[: CLOUDS // 4]:
-        cloud = torch.from_numpy(surface.sample_area(shapes.make(name), 5 * POINTS * RATIO, generator)).float()
-        targets.append(cloud[patches.extract(cloud, 4, POINTS * RATIO)])
+        cloud = torch.from_numpy(mesh_sampling.sample_area(shapes.make(name), 5 * POINTS * RATIO, generator)).float()
+        targets.append(cloud[patch_extraction.extract(cloud, 4, POINTS * RATIO)])
     target = torch.cat(targets)
     target = target[:, torch.from_numpy(generator.permutation(POINTS * RATIO))]
     target = unit_sphere_frame(target[..., :3]).to_unit(target)

@@ -12,10 +12,10 @@ import numpy as np
 
 import pnu
 from pnu.data import shapes
+from pnu.geometry.mesh_sampling import closest_points, sample_area
 from pnu.io import Cloud, read_cloud, write_cloud, write_mesh
-from pnu.ops.surface import closest_points, sample_area
-from pnu.pictures import figure, look_at, render_cloud, render_mesh, save_png
-from pnu.surfaces import reconstruct
+from pnu.reconstruction import reconstruct
+from pnu.rendering import figure, look_at, render_cloud, render_mesh, save_png
 
 folder = Path(sys.argv[2] if len(sys.argv) > 2 else "scan_to_mesh")
 folder.mkdir(parents=True, exist_ok=True)

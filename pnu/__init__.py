@@ -15,10 +15,14 @@ __version__ = "0.1.0"
 __all__ = ["__version__", "load", "normals", "upsample"]
 
 if TYPE_CHECKING:
-    from pnu.checkpoint import load
-    from pnu.inference import normals, upsample
+    from pnu.networks.checkpoints import load
+    from pnu.upsamplers.whole_clouds import normals, upsample
 
-HOMES = {"load": "pnu.checkpoint", "normals": "pnu.inference", "upsample": "pnu.inference"}
+HOMES = {
+    "load": "pnu.networks.checkpoints",
+    "normals": "pnu.upsamplers.whole_clouds",
+    "upsample": "pnu.upsamplers.whole_clouds",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -74,8 +74,8 @@ def read_mesh(path: Path) -> None:
 def read_patches(path: Path) -> None:
     import torch
 
-    from pnu.data.dataset import Options, PatchDataset
-    from pnu.data.patchset import check, describe
+    from pnu.data.patch_dataset import Options, PatchDataset
+    from pnu.data.patch_file import check, describe
 
     contents = check(path)
     describe(path)
@@ -667,13 +667,12 @@ def child(names: list[str], cases: int, start: int, folder: Path) -> None:
     """Run the cases of readers; prints a line of JSON a reader: how many were refused, and what went wrong."""
     import torch
 
-    from pnu import checkpoint
-    from pnu.networks import build
+    from pnu.networks import build, checkpoints
 
     torch.set_num_threads(1)
     if any(READERS[name].read in (read_checkpoint, read_weights, read_config) for name in names):
         for run in ("run", "run with config"):
-            checkpoint.save(folder / run, network := build(MODEL), MODEL, {})
+            checkpoints.save(folder / run, network := build(MODEL), MODEL, {})
         outputs_of(network.eval())  # loads what the first call loads
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + GIBIBYTE, used + GIBIBYTE))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from pnu.run.provenance import provenance
+from pnu.runtime.provenance import provenance
 
 PARTS = {
     "test_soak.py": "killed at random moments, and on with it",

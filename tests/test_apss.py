@@ -5,8 +5,8 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from pnu.ops import apss
-from pnu.ops.apss import apss_project, fit_sphere, project_to_sphere
+from pnu.geometry import algebraic_sphere
+from pnu.geometry.algebraic_sphere import apss_project, fit_sphere, project_to_sphere
 
 
 def sphere(n: int, radius: float = 1.0, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> torch.Tensor:
@@ -89,7 +89,7 @@ def test_moves_with_the_cloud() -> None:
 def test_chunks_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud, query = sphere(300), sphere(300)[:, :3] + 0.1 * noise(300)
     whole = apss_project(query, cloud, 8)
-    monkeypatch.setattr(apss, "CHUNK_NEIGHBOURS", 8 * 37)
+    monkeypatch.setattr(algebraic_sphere, "CHUNK_NEIGHBOURS", 8 * 37)
     assert torch.equal(apss_project(query, cloud, 8), whole)
 
 

@@ -6,8 +6,8 @@ import sys
 import numpy as np
 import pytest
 
+from pnu.geometry.attributes import carry
 from pnu.io import read_cloud, write_cloud
-from pnu.ops.attributes import carry
 
 RNG = np.random.default_rng(0)
 
@@ -63,7 +63,16 @@ def test_colours_of_a_thin_sheet_reach_the_file(tmp_path, suffix: str) -> None:
     cloud = np.vstack([plane(400, 0.008), plane(400, -0.008, -1.0)])
     colors = np.where(sides[:, None] > 0, [[200, 0, 0]], [[0, 0, 100]]).astype(np.uint8)
     write_cloud(tmp_path / "in.ply", cloud[:, :3], cloud[:, 3:], {"colors": colors, "side": sides})
-    command = [sys.executable, "-m", "pnu.upsample", "input=in.ply", f"output=out{suffix}", "run=surface", "quiet=true"]
+    command = [
+        sys.executable,
+        "-m",
+        "pnu",
+        "upsample",
+        "input=in.ply",
+        f"output=out{suffix}",
+        "run=surface",
+        "quiet=true",
+    ]
     subprocess.run(command, cwd=tmp_path, check=True, timeout=120)
     dense = read_cloud(tmp_path / f"out{suffix}")
     assert dense.normals is not None

@@ -10,8 +10,8 @@ import torch
 import yaml
 
 import pnu
-from pnu import checkpoint
 from pnu.io import read_json, write_json
+from pnu.networks import checkpoints
 from pnu.networks.pnu import PNU
 
 MODEL = {"_target_": "pnu.networks.pnu.PNU", "ratio": 2, "local_features": False}
@@ -24,7 +24,7 @@ def network(seed: int = 0) -> PNU:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    checkpoint.save(tmp_path / "run", network(), MODEL, {"epoch": 3})
+    checkpoints.save(tmp_path / "run", network(), MODEL, {"epoch": 3})
     return tmp_path / "run"
 
 
@@ -121,22 +121,22 @@ def test_broken_file(run: Path, content: bytes) -> None:
 
 def test_numpy_scalars_are_plain(tmp_path: Path) -> None:
     torch.save({"loss": np.float32(0.25), "epoch": np.int64(3), "other": np.float64(0.5)}, tmp_path / "a.pt")
-    assert checkpoint.read(tmp_path / "a.pt") == {"loss": 0.25, "epoch": 3, "other": 0.5}
+    assert checkpoints.read(tmp_path / "a.pt") == {"loss": 0.25, "epoch": 3, "other": 0.5}
 
 
 def test_newest_run(tmp_path: Path) -> None:
-    assert checkpoint.newest_run(tmp_path) is None
+    assert checkpoints.newest_run(tmp_path) is None
     ends = {"b": "2026-01-02T10:00:00+00:00", "a": "2026-01-02T12:30:00+02:00", "c": "2026-01-01T10:00:00+00:00"}
     for name, ended in ends.items():
-        checkpoint.save(tmp_path / name, network(), MODEL, {"ended": ended})
-    assert checkpoint.newest_run(tmp_path) == tmp_path / "a"
+        checkpoints.save(tmp_path / name, network(), MODEL, {"ended": ended})
+    assert checkpoints.newest_run(tmp_path) == tmp_path / "a"
     write_json(tmp_path / "a" / "run.json", {"status": "failed", "ended": "2027-01-01T00:00:00+00:00"})
-    assert checkpoint.newest_run(tmp_path) == tmp_path / "b"
+    assert checkpoints.newest_run(tmp_path) == tmp_path / "b"
     (tmp_path / "b" / "checkpoints" / "best.ckpt").unlink()
     (tmp_path / "a" / "run.json").write_text("{broken")
-    assert checkpoint.newest_run(tmp_path) == tmp_path / "c"
-    checkpoint.save(tmp_path / "d", network(), MODEL, {})  # ended when its record was written: now
-    assert checkpoint.newest_run(tmp_path) == tmp_path / "d"
+    assert checkpoints.newest_run(tmp_path) == tmp_path / "c"
+    checkpoints.save(tmp_path / "d", network(), MODEL, {})  # ended when its record was written: now
+    assert checkpoints.newest_run(tmp_path) == tmp_path / "d"
 
 
 def test_failed_save_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,5 +145,5 @@ def test_failed_save_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(torch, "save", fail)
     with pytest.raises(ValueError, match=r"run: cannot be written \(No space left on device\); choose another folder"):
-        checkpoint.save(tmp_path / "run", network(), MODEL, {})
+        checkpoints.save(tmp_path / "run", network(), MODEL, {})
     assert not list(tmp_path.iterdir())

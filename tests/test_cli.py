@@ -15,7 +15,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from pnu.checkpoint import read
+from pnu.networks.checkpoints import read
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -55,7 +55,7 @@ def loaded_by(*arguments: str) -> set[str]:
     """Top-level modules that a command has imported when it ends."""
     code = (
         "import sys, atexit; atexit.register(lambda: print('MODULES', *{m.split('.')[0] for m in sys.modules}));"
-        f"from pnu.train import main; main({list(arguments)!r})"
+        f"from pnu.commands.train import main; main({list(arguments)!r})"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     return set(done.stdout.rpartition("MODULES")[2].split())
@@ -80,7 +80,9 @@ def test_help_tells_every_key_with_its_value(tmp_path: Path) -> None:
 
 
 def test_help_tells_the_keys_of_a_command_before_those_of_groups() -> None:
-    done = subprocess.run([sys.executable, "-m", "pnu.evaluate", "--help"], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "pnu", "evaluate", "--help"], capture_output=True, text=True, check=True
+    )
     assert done.stdout.index("truth_points=") < done.stdout.index("data.val_share=")
 
 
@@ -106,9 +108,7 @@ def test_one_line_trains(tmp_path: Path, small: list[str]) -> None:
     done = train(tmp_path, *small, "loss.w3=0.05", "trainer.max_steps=20")
     assert (done.returncode, done.stderr) == (0, "")
     (run,) = tmp_path.glob("outputs/*/*_train")
-    assert (
-        f"next: python -m pnu.upsample input=cloud.ply output=dense.ply run={run.relative_to(tmp_path)}" in done.stdout
-    )
+    assert f"next: pnu upsample input=cloud.ply output=dense.ply run={run.relative_to(tmp_path)}" in done.stdout
     assert "CD x 1e3" in done.stdout
     assert read(run / "checkpoints/last.ckpt")["global_step"] == 20
 

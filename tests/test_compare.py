@@ -10,14 +10,15 @@ import pytest
 import torch
 from PIL import Image
 
-from pnu import checkpoint, comparison
-from pnu.compare import main, runs_of_sweep
-from pnu.comparison.shapes import error_limit, points_for, rebuild, view
-from pnu.comparison.tables import tables
-from pnu.evaluation import Case, Truth
+from pnu.benchmark import Case, Truth
+from pnu.commands.compare import main, runs_of_sweep
+from pnu.geometry.mesh_sampling import sample_poisson_disk
 from pnu.io import read_json, write_json, write_mesh
+from pnu.networks import checkpoints
 from pnu.networks.pnu import PNU
-from pnu.ops.surface import sample_poisson_disk
+from pnu.report import comparison_page
+from pnu.report.comparison_tables import tables
+from pnu.report.shape_views import error_limit, points_for, rebuild, view
 from tests.test_page import CHROMIUM, browse
 from tests.test_surfaces import icosphere
 
@@ -34,7 +35,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_mesh(place / "meshes" / "ball.ply", ball)
     write_mesh(place / "meshes" / "egg.off", ball._replace(vertices=3 * ball.vertices * [1, 1.5, 1]))
     torch.manual_seed(0)
-    checkpoint.save(place / "runs" / "first", PNU(ratio=2, local_features=False), NETWORK, {})
+    checkpoints.save(place / "runs" / "first", PNU(ratio=2, local_features=False), NETWORK, {})
     return place
 
 
@@ -149,20 +150,20 @@ def case() -> Case:
 
 
 def test_a_surface_that_fails_is_left_out_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = comparison.Shown.of(case())
+    shown = comparison_page.Shown.of(case())
     shown.clouds["bare"] = shown.clouds["input"][:, :3]
 
     def fail(*args: object, **kwargs: object) -> None:
         raise ValueError("Poisson reconstruction at depth=6 was killed by SIGSEGV")
 
-    monkeypatch.setattr("pnu.surfaces.reconstruct", fail)
+    monkeypatch.setattr("pnu.reconstruction.reconstruct", fail)
     made, notes = rebuild(shown)
     assert made == {}
     assert notes == ["input, ball, uniform: Poisson reconstruction at depth=6 was killed by SIGSEGV"]
 
 
 def test_clouds_are_thinned_to_the_size_of_the_page() -> None:
-    shown = comparison.Shown.of(case())
+    shown = comparison_page.Shown.of(case())
     drawings = view(shown, {}, 90).drawings
     assert [len(drawing.cloud) for drawing in drawings if drawing.cloud is not None] == [67, 89]
     assert points_for(40, 100, 0) == 33333

@@ -1,4 +1,4 @@
-"""`python -m pnu.convert` on checkpoints as the released code writes them."""
+"""`pnu convert` on checkpoints as the released code writes them."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import pnu
-from pnu.convert import main
+from pnu.commands.convert import main
 from pnu.io import read_json
 from tests.commands import refused
 
@@ -34,7 +34,7 @@ def test_conversion(released: dict[str, np.ndarray], capsys: pytest.CaptureFixtu
     assert capsys.readouterr().out.splitlines() == [
         "input:  epoch_7.pt, epoch 7",
         "run:    run",
-        "next:   python -m pnu.upsample run=run input=cloud.ply output=dense.ply",
+        "next:   pnu upsample run=run input=cloud.ply output=dense.ply",
     ]
     network = pnu.load("run")
     with torch.no_grad():

@@ -12,14 +12,14 @@ import pytest
 import torch
 
 from pnu.data import shapes
+from pnu.data.crop_module import ProjectionDataModule
 from pnu.data.crops import Crops, WholeClouds, flattened
-from pnu.data.projection import ProjectionDataModule
-from pnu.data.truth import Truth
+from pnu.data.mesh_scene import Truth
+from pnu.geometry.mesh_sampling import closest_points, face_normals, sample_area
 from pnu.io import Mesh, write_mesh
-from pnu.lit import TRAINER_OPTIONS, quieten
-from pnu.losses.surface import SurfaceLoss
+from pnu.losses.projection import SurfaceLoss
 from pnu.networks.surface import Surface
-from pnu.ops.surface import closest_points, face_normals, sample_area
+from pnu.training.lightning_module import TRAINER_OPTIONS, quieten
 
 NAMES = sorted(shapes.names())[:2] + sorted(shapes.names("cad"))[-1:]
 

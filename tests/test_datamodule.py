@@ -12,9 +12,9 @@ import pytest
 import torch
 
 from pnu.data import shapes
-from pnu.data.datamodule import MeshDataModule, PatchDataModule, SyntheticDataModule
-from pnu.data.dataset import EpochSampler, Options, PatchDataset, split
-from pnu.data.patchset import build
+from pnu.data.patch_dataset import EpochSampler, Options, PatchDataset, split
+from pnu.data.patch_file import build
+from pnu.data.patch_module import MeshDataModule, PatchDataModule, SyntheticDataModule
 from pnu.io import write_mesh
 
 SMALL = {"input_points": 64, "target_points": 256, "batch_size": 2}

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from pnu import checkpoint
-from pnu.checkpoint import read
-from pnu.networks import build
+from pnu.networks import build, checkpoints
+from pnu.networks.checkpoints import read
 from tests.test_cli import small  # noqa: F401  a fixture
 
 PNU = {"_target_": "pnu.networks.pnu.PNU", "ratio": 2, "local_features": False}
@@ -86,7 +85,7 @@ def place(disk: Path) -> Path:
     """With a cloud and a run folder."""
     points = np.random.default_rng(0).normal(size=(500, 3))
     np.savetxt(disk / "cloud.xyz", points / np.linalg.norm(points, axis=1, keepdims=True))
-    checkpoint.save(disk / "run", build(PNU), PNU, {})
+    checkpoints.save(disk / "run", build(PNU), PNU, {})
     return disk
 
 

@@ -14,14 +14,14 @@ import pytest
 import torch
 from PIL import Image
 
+from pnu.commands.doctor import open3d_error
+from pnu.commands.train import Train
+from pnu.config.compose import compose_config
 from pnu.data import shapes
-from pnu.doctor import open3d_error
+from pnu.geometry.mesh_sampling import sample_area
 from pnu.io import read_cloud, read_mesh, write_cloud, write_mesh
 from pnu.networks.pnu import PNU
 from pnu.networks.released import rename
-from pnu.ops.surface import sample_area
-from pnu.run.config import compose_config
-from pnu.train import Train
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("docs/**/*.md"))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pnu import doctor
+from pnu.runtime import system_libraries
 
 MISSING = {"libnothing-here.so.0": "libnothing0", "libc.so.6": "libc6"}
 LINE = "apt-get install --no-install-recommends libnothing0"
@@ -16,8 +16,8 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> None:
     """Debian that lacks a library; open3d cannot be imported."""
     if not sys.platform.startswith("linux"):
         pytest.skip("asks for libraries of Linux")
-    monkeypatch.setattr(doctor, "LIBRARIES", MISSING)
-    monkeypatch.setattr(doctor, "open3d_error", lambda: "ImportError: libnothing-here.so.0: no such file")
+    monkeypatch.setattr(system_libraries, "LIBRARIES", MISSING)
+    monkeypatch.setattr(system_libraries, "open3d_error", lambda: "ImportError: libnothing-here.so.0: no such file")
     monkeypatch.setattr(sys, "argv", ["doctor"])
 
 
@@ -31,7 +31,7 @@ def apt_get(folder: Path, monkeypatch: pytest.MonkeyPatch, code: int = 0) -> Pat
 
 
 def test_says_what_is_missing_and_the_line_to_run(capsys: pytest.CaptureFixture[str]) -> None:
-    doctor.main()
+    system_libraries.main()
     printed = capsys.readouterr()
     assert LINE in printed.out
     assert printed.err == "open3d cannot be imported: ImportError: libnothing-here.so.0: no such file\n"
@@ -40,14 +40,14 @@ def test_says_what_is_missing_and_the_line_to_run(capsys: pytest.CaptureFixture[
 def test_require_is_an_exit_code(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["doctor", "--require"])
     with pytest.raises(SystemExit) as stopped:
-        doctor.main()
+        system_libraries.main()
     assert stopped.value.code == 1
 
 
 def test_installs_as_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     calls = apt_get(tmp_path, monkeypatch)
     monkeypatch.setattr(sys, "argv", ["doctor", "--install"])
-    doctor.main()
+    system_libraries.main()
     assert calls.read_text().splitlines() == ["update -qq", "install -qq --no-install-recommends libnothing0"]
     assert LINE in capsys.readouterr().out, "it is still missing: the program did nothing"
 
@@ -62,20 +62,20 @@ def test_where_it_cannot_install_it_says_so_and_goes_on(
     if why == "no apt-get":
         monkeypatch.setenv("PATH", "")
     monkeypatch.setattr(sys, "argv", ["doctor", "--install"])
-    assert not doctor.install(["libnothing0"])
+    assert not system_libraries.install(["libnothing0"])
     assert calls.exists() == (why == "it fails")
-    doctor.main()
+    system_libraries.main()
     assert LINE in capsys.readouterr().out
 
 
 def test_all_is_there(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(doctor, "LIBRARIES", {"libc.so.6": "libc6"})
-    monkeypatch.setattr(doctor, "open3d_error", lambda: None)
-    doctor.main()
+    monkeypatch.setattr(system_libraries, "LIBRARIES", {"libc.so.6": "libc6"})
+    monkeypatch.setattr(system_libraries, "open3d_error", lambda: None)
+    system_libraries.main()
     assert capsys.readouterr().out == "open3d and the system libraries it needs are here.\n"
 
 
 def test_other_arguments_print_the_help(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["doctor", "--instal"])
     with pytest.raises(SystemExit, match="--install"):
-        doctor.main()
+        system_libraries.main()

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from pnu.geometry.sharp_edges import sharp_edge_points, sharp_edges
 from pnu.io import Mesh
-from pnu.ops.edges import sharp_edge_points, sharp_edges
 
 
 @pytest.fixture

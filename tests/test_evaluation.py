@@ -14,13 +14,13 @@ import pytest
 import torch
 import yaml
 
-from pnu import evaluation, metrics
+from pnu import benchmark, metrics
+from pnu.benchmark import cases, cost, result_tables
+from pnu.commands.evaluate import main
 from pnu.data import shapes
-from pnu.evaluate import main
-from pnu.evaluation import cases, cost, report
+from pnu.geometry.mesh_sampling import closest_points, sample_area, sample_poisson_disk
 from pnu.io import Mesh, read_cloud, read_json, write_cloud, write_json, write_mesh
 from pnu.networks.pnu import PNU
-from pnu.ops.surface import closest_points, sample_area, sample_poisson_disk
 from pnu.upsamplers import classical
 
 
@@ -30,8 +30,8 @@ def box() -> Mesh:
 
 
 @pytest.fixture(scope="module")
-def truth(box: Mesh) -> evaluation.Truth:
-    return evaluation.truth_of_mesh("heat_sink", box, 4000, seed=0)
+def truth(box: Mesh) -> benchmark.Truth:
+    return benchmark.truth_of_mesh("heat_sink", box, 4000, seed=0)
 
 
 def silent(text: str) -> None:
@@ -41,8 +41,8 @@ def silent(text: str) -> None:
 # Inputs
 
 
-@pytest.mark.parametrize("kind", evaluation.KINDS)
-def test_inputs_lie_on_the_surface_and_come_from_the_seed(truth: evaluation.Truth, kind: str) -> None:
+@pytest.mark.parametrize("kind", benchmark.KINDS)
+def test_inputs_lie_on_the_surface_and_come_from_the_seed(truth: benchmark.Truth, kind: str) -> None:
     assert truth.mesh is not None
     cloud = cases.draw_input(truth, kind, 2000, cases.generator(0, "a", kind))
     assert len(cloud) == (500 if kind == "sparse" else 2000)
@@ -57,8 +57,8 @@ def test_inputs_lie_on_the_surface_and_come_from_the_seed(truth: evaluation.Trut
         assert not np.array_equal(cloud, other)
 
 
-def test_kinds_differ_as_they_should(truth: evaluation.Truth) -> None:
-    clouds = {k: cases.draw_input(truth, k, 2000, cases.generator(0, "a", k)) for k in evaluation.KINDS}
+def test_kinds_differ_as_they_should(truth: benchmark.Truth) -> None:
+    clouds = {k: cases.draw_input(truth, k, 2000, cases.generator(0, "a", k)) for k in benchmark.KINDS}
     spacing = {kind: float(metrics.spacing_cv(cloud)) for kind, cloud in clouds.items()}
     density = {kind: float(metrics.uniformity(cloud, truth.samples)) for kind, cloud in clouds.items()}
     assert max(spacing["uniform"], spacing["sparse"]) < 0.2 < 0.45 < min(spacing["random"], spacing["nonuniform"])
@@ -67,20 +67,20 @@ def test_kinds_differ_as_they_should(truth: evaluation.Truth) -> None:
 
 def test_truth_is_brought_to_its_unit_sphere(box: Mesh) -> None:
     far = Mesh(40 * box.vertices + 1e4, box.faces)
-    moved = evaluation.truth_of_mesh("heat_sink", far, 4000, seed=0, warn=silent)
+    moved = benchmark.truth_of_mesh("heat_sink", far, 4000, seed=0, warn=silent)
     assert moved.mesh is not None
     assert moved.frame == "unit sphere of the truth"
     assert np.linalg.norm(moved.mesh.vertices, axis=1).max() == pytest.approx(1)
     np.testing.assert_allclose(moved.samples[:, :3].mean(0), 0, atol=0.01)
     np.testing.assert_allclose(closest_points(moved.mesh, moved.samples[:, :3])[1], 0, atol=1e-9)
-    assert evaluation.truth_of_mesh("heat_sink", box, 4000, seed=0).frame == "as given, a unit sphere"
+    assert benchmark.truth_of_mesh("heat_sink", box, 4000, seed=0).frame == "as given, a unit sphere"
 
 
 def test_a_small_shape_beside_the_origin_is_in_no_unit_sphere(box: Mesh) -> None:
     """Its farthest vertex is at 1 as well: taken as it is, CD would be 100 times too small."""
     aside = box.vertices * 0.1 + [0.9, 0, 0]
     aside /= np.linalg.norm(aside, axis=1).max()
-    made = evaluation.truth_of_mesh("aside", Mesh(aside, box.faces), 2000, seed=0, warn=silent)
+    made = benchmark.truth_of_mesh("aside", Mesh(aside, box.faces), 2000, seed=0, warn=silent)
     assert made.frame == "unit sphere of the truth"
     assert made.mesh is not None
     assert np.linalg.norm(made.mesh.vertices, axis=1).max() == pytest.approx(1)
@@ -104,7 +104,7 @@ def test_a_unit_sphere_about_any_usual_center_stays(center: str) -> None:
 
 def test_a_mesh_that_is_not_watertight_warns_and_works(box: Mesh) -> None:
     warnings: list[str] = []
-    opened = evaluation.truth_of_mesh("open", Mesh(box.vertices, box.faces[1:]), 500, 0, warn=warnings.append)
+    opened = benchmark.truth_of_mesh("open", Mesh(box.vertices, box.faces[1:]), 500, 0, warn=warnings.append)
     assert warnings == ["open: is not watertight (3 open edges); taken as an open surface"]
     assert len(opened.samples) == 500
 
@@ -112,25 +112,23 @@ def test_a_mesh_that_is_not_watertight_warns_and_works(box: Mesh) -> None:
 # Numbers
 
 
-def test_measure_is_the_metrics_with_the_normals_of_the_mesh(truth: evaluation.Truth) -> None:
+def test_measure_is_the_metrics_with_the_normals_of_the_mesh(truth: benchmark.Truth) -> None:
     assert truth.mesh is not None
     cloud = cases.draw_input(truth, "noise_1", 800, np.random.default_rng(0))
-    found = evaluation.measure(cloud, truth)
+    found = benchmark.measure(cloud, truth)
     error = metrics.normal_error(cloud, truth.mesh)
     assert found["chamfer_sq"] == float(metrics.chamfer_sq(cloud, truth.samples))
     assert found["p2f"] == float(metrics.point_to_mesh(cloud, truth.mesh))
     assert (found["normal_deg"], found["flipped"]) == (float(error.signed_deg), float(error.flipped))
     assert list(found) == [metric.shown.name for metric in metrics.METRICS]
-    without = evaluation.measure(cloud, truth._replace(mesh=None, samples=truth.samples[:, :3]))
+    without = benchmark.measure(cloud, truth._replace(mesh=None, samples=truth.samples[:, :3]))
     assert set(without) == {"chamfer_sq", "hausdorff_sq", "spacing_cv", "uniformity"}
 
 
 def test_rows_of_methods_and_references(box: Mesh) -> None:
     """An upsampler that knows the surface scores like the floor, and its input's row scores what the input scores."""
     meshes = {"heat_sink": lambda: box}
-    drawn = list(
-        evaluation.mesh_cases(meshes, ["random", "sparse"], points=600, truth_points=4000, seed=3, warn=silent)
-    )
+    drawn = list(benchmark.mesh_cases(meshes, ["random", "sparse"], points=600, truth_points=4000, seed=3, warn=silent))
 
     def perfect(points: np.ndarray, normals: np.ndarray | None) -> np.ndarray:
         return sample_poisson_disk(drawn[0].truth.mesh, 4 * len(points), np.random.default_rng(7))  # type: ignore[arg-type]
@@ -138,10 +136,10 @@ def test_rows_of_methods_and_references(box: Mesh) -> None:
     kept: dict[tuple[str, str], np.ndarray] = {}
     steps: list[str] = []
 
-    def keep(case: evaluation.Case, name: str, cloud: np.ndarray) -> None:
+    def keep(case: benchmark.Case, name: str, cloud: np.ndarray) -> None:
         kept[case.kind, name] = cloud
 
-    rows = list(evaluation.evaluate({"perfect": perfect}, drawn, ratio=4, step=steps.append, keep=keep))
+    rows = list(benchmark.evaluate({"perfect": perfect}, drawn, ratio=4, step=steps.append, keep=keep))
     assert [(row["kind"], row["method"]) for row in rows] == [
         (kind, method) for kind in ("random", "sparse") for method in ("perfect", "floor", "input")
     ]
@@ -162,17 +160,17 @@ def test_rows_of_methods_and_references(box: Mesh) -> None:
 
 
 def test_a_wrong_number_of_points_is_an_error(box: Mesh) -> None:
-    drawn = evaluation.mesh_cases({"heat_sink": lambda: box}, ["random"], points=100, truth_points=400)
+    drawn = benchmark.mesh_cases({"heat_sink": lambda: box}, ["random"], points=100, truth_points=400)
     with pytest.raises(ValueError, match="copy: gave 100 points for heat_sink, expected 200"):
-        list(evaluation.evaluate({"copy": lambda points, normals: points}, drawn, ratio=2))
+        list(benchmark.evaluate({"copy": lambda points, normals: points}, drawn, ratio=2))
 
 
 def test_inputs_without_normals() -> None:
     meshes = {"pear": lambda: shapes.make("pear")}
-    drawn = list(evaluation.mesh_cases(meshes, ["uniform"], points=500, truth_points=2000, normals=False))
+    drawn = list(benchmark.mesh_cases(meshes, ["uniform"], points=500, truth_points=2000, normals=False))
     assert drawn[0].normals is None
-    upsampler = evaluation.network_upsampler(classical("midpoint"), 2)
-    made, _, given = evaluation.evaluate({"midpoint": upsampler}, drawn, ratio=2)
+    upsampler = benchmark.network_upsampler(classical("midpoint"), 2)
+    made, _, given = benchmark.evaluate({"midpoint": upsampler}, drawn, ratio=2)
     assert 0 < given["normal_unsigned_deg"] < 20  # estimated
     assert made["normal_unsigned_deg"] < 20
 
@@ -180,10 +178,10 @@ def test_inputs_without_normals() -> None:
 def test_a_network_of_another_ratio_needs_leave() -> None:
     network = PNU(ratio=2, local_features=False).eval()
     with pytest.raises(ValueError, match="ratio=4: the-run was trained for 2; give ratio=2, or passes=true"):
-        evaluation.network_upsampler(network, 4, name="the-run")
+        benchmark.network_upsampler(network, 4, name="the-run")
     points = np.random.default_rng(0).normal(size=(100, 3))
-    assert len(evaluation.network_upsampler(network, 3, passes=True)(points, points)) == 300
-    assert len(evaluation.network_upsampler(network, 2)(points, points)) == 200
+    assert len(benchmark.network_upsampler(network, 3, passes=True)(points, points)) == 300
+    assert len(benchmark.network_upsampler(network, 2)(points, points)) == 200
 
 
 def test_summary_by_hand() -> None:
@@ -191,14 +189,14 @@ def test_summary_by_hand() -> None:
         {"shape": s, "kind": "random", "method": "m", "chamfer_sq": v, **more}
         for s, v, more in (("a", 1.0, {"p2f": 2.0}), ("b", 3.0, {}), ("c", 8.0, {"p2f": 4.0}))
     ]
-    (summary,) = evaluation.summarize(rows)
+    (summary,) = benchmark.summarize(rows)
     assert (summary["shapes"], summary["chamfer_sq"]) == (3, 4.0)
     assert summary["chamfer_sq_std"] == pytest.approx(math.sqrt((9 + 1 + 16) / 2))
     assert math.isnan(summary["p2f"])  # a shape without a value must not vanish from the mean
-    assert math.isnan(evaluation.summarize(rows[:1])[0]["chamfer_sq_std"])
-    chamfer, p2f = evaluation.columns(rows)
-    assert report.cell(summary, p2f) == "-"
-    assert report.cell(summary, chamfer) == "4000.0000"
+    assert math.isnan(benchmark.summarize(rows[:1])[0]["chamfer_sq_std"])
+    chamfer, p2f = benchmark.columns(rows)
+    assert result_tables.cell(summary, p2f) == "-"
+    assert result_tables.cell(summary, chamfer) == "4000.0000"
 
 
 def test_cost_sees_memory_and_children() -> None:
@@ -220,11 +218,11 @@ def test_cost_sees_memory_and_children() -> None:
 
 def test_source_of_procedural_shapes() -> None:
     data = {"kinds": ["cad"], "val_share": 0.1, "test_share": 0.2}
-    parts = {part: evaluation.source(data, part=part).shapes for part in evaluation.PARTS}
+    parts = {part: benchmark.source(data, part=part).shapes for part in benchmark.PARTS}
     assert sorted(parts["train"] + parts["val"] + parts["test"]) == parts["all"] == shapes.names("cad")
-    found = evaluation.source(data)
-    assert (found.name, found.shapes, found.kinds) == ("synthetic", parts["test"], list(evaluation.KINDS))
-    some = evaluation.source(data, ["random"], only=["wedge", "cup"], points=100, truth_points=200)
+    found = benchmark.source(data)
+    assert (found.name, found.shapes, found.kinds) == ("synthetic", parts["test"], list(benchmark.KINDS))
+    some = benchmark.source(data, ["random"], only=["wedge", "cup"], points=100, truth_points=200)
     assert [(case.truth.shape, len(case.points)) for case in some.cases] == [("wedge", 100), ("cup", 100)]
 
 
@@ -232,7 +230,7 @@ def test_source_of_a_folder_of_meshes(tmp_path: Path, box: Mesh) -> None:
     (tmp_path / "more").mkdir()
     write_mesh(tmp_path / "a.off", box)
     write_mesh(tmp_path / "more" / "b.stl", Mesh(box.vertices * 7, box.faces))
-    found = evaluation.source({"root": str(tmp_path)}, ["uniform"], points=64, truth_points=150)
+    found = benchmark.source({"root": str(tmp_path)}, ["uniform"], points=64, truth_points=150)
     assert (found.name, found.shapes) == (tmp_path.name, ["a", "more_b"])
     assert [case.truth.frame for case in found.cases] == ["as given, a unit sphere", "unit sphere of the truth"]
 
@@ -251,7 +249,7 @@ def test_source_of_a_folder_of_meshes(tmp_path: Path, box: Mesh) -> None:
 )
 def test_sources_refuse_at_once(data: dict, options: dict, text: str) -> None:
     with pytest.raises(ValueError, match=text):
-        evaluation.source(data, **options)
+        benchmark.source(data, **options)
 
 
 # Prepared pairs
@@ -270,7 +268,7 @@ def pairs(tmp_path: Path, box: Mesh) -> Path:
 
 
 def test_pairs_are_compared_in_the_unit_sphere_of_the_truth(pairs: Path) -> None:
-    found = evaluation.source({"root": str(pairs)}, truth_points=2000, warn=silent)
+    found = benchmark.source({"root": str(pairs)}, truth_points=2000, warn=silent)
     (case,) = found.cases
     assert (found.name, found.shapes, found.kinds, case.kind) == ("pairs", ["sink"], ["given"], "given")
     assert case.truth.mesh is not None
@@ -282,11 +280,11 @@ def test_pairs_are_compared_in_the_unit_sphere_of_the_truth(pairs: Path) -> None
 def test_pairs_with_samples_only_have_no_floor_and_no_p2f(pairs: Path, box: Mesh) -> None:
     even = sample_poisson_disk(box, 1000, np.random.default_rng(1))
     np.save(pairs / "truth" / "sink_1000.npy", np.hstack([40 * even[:, :3] + 1e4, even[:, 3:]]))
-    (case,) = evaluation.source({"root": str(pairs)}, truth_points=1000, warn=silent).cases
+    (case,) = benchmark.source({"root": str(pairs)}, truth_points=1000, warn=silent).cases
     assert len(case.truth.samples) == 1000
     (pairs / "truth" / "sink.ply").unlink()
-    (case,) = evaluation.source({"root": str(pairs)}).cases
-    rows = list(evaluation.evaluate({}, [case], ratio=4))
+    (case,) = benchmark.source({"root": str(pairs)}).cases
+    rows = list(benchmark.evaluate({}, [case], ratio=4))
     assert [row["method"] for row in rows] == ["input"]
     assert "p2f" not in rows[0]
     assert rows[0]["normal_unsigned_deg"] < 30
@@ -303,10 +301,10 @@ def test_of_several_samples_those_asked_for_are_taken(pairs: Path, box: Mesh) ->
     save_samples(pairs, box, 500, 2000, 900)  # by their names, 900 is the last
     np.save(pairs / "truth" / "sink_more.npy", np.zeros((5, 3)))  # no count
     for count in (500, 2000, 900):
-        (case,) = evaluation.source({"root": str(pairs)}, truth_points=count, warn=silent).cases
+        (case,) = benchmark.source({"root": str(pairs)}, truth_points=count, warn=silent).cases
         assert len(case.truth.samples) == count
     said: list[str] = []
-    (case,) = evaluation.source({"root": str(pairs)}, truth_points=1000, warn=said.append).cases
+    (case,) = benchmark.source({"root": str(pairs)}, truth_points=1000, warn=said.append).cases
     assert len(case.truth.samples) == 2000
     name = pairs / "truth" / "sink_2000.npy"
     assert said == [f"{name}: is compared with, since there is no sink_1000.npy (truth_points=1000)"]
@@ -324,7 +322,7 @@ def test_what_is_recorded_is_what_was_used(pairs: Path, box: Mesh, tmp_path: Pat
 def test_pairs_of_which_it_is_unclear_what_is_meant_are_refused(pairs: Path, box: Mesh) -> None:
     def refused(text: str) -> None:
         with pytest.raises(ValueError, match=text):
-            list(evaluation.source({"root": str(pairs)}, truth_points=500).cases)
+            list(benchmark.source({"root": str(pairs)}, truth_points=500).cases)
 
     np.save(pairs / "truth" / "sink_500.npy", sample_area(box, 499, np.random.default_rng(0))[:, :3])
     refused("sink_500.npy: holds 499 points, its name says another number; rename it")
@@ -344,22 +342,22 @@ def test_vertices_without_a_face_decide_no_frame(pairs: Path, box: Mesh) -> None
     write_mesh(pairs / "truth" / "sink.ply", mesh)
     write_cloud(pairs / "clouds" / "sink.xyz", sample_area(box, 500, np.random.default_rng(0))[:, :3] + 40)
     with pytest.raises(ValueError, match="is not in the frame of"):
-        list(evaluation.source({"root": str(pairs)}, truth_points=500, warn=silent).cases)
+        list(benchmark.source({"root": str(pairs)}, truth_points=500, warn=silent).cases)
 
 
 def test_pairs_in_different_frames_are_refused(pairs: Path, box: Mesh) -> None:
     write_mesh(pairs / "truth" / "sink.ply", box)
     with pytest.raises(ValueError, match=r"the truth of sink: is not in the frame of .*sink.xyz"):
-        list(evaluation.source({"root": str(pairs)}).cases)
+        list(benchmark.source({"root": str(pairs)}).cases)
     (pairs / "truth" / "sink.ply").unlink()
     np.save(pairs / "truth" / "sink_900.npy", sample_area(box, 900, np.random.default_rng(0)))
     with pytest.raises(ValueError, match="is not in the frame of"):
-        list(evaluation.source({"root": str(pairs)}).cases)
+        list(benchmark.source({"root": str(pairs)}).cases)
     (pairs / "truth" / "sink_900.npy").unlink()
     with pytest.raises(
         ValueError, match=r"truth: expected sink.ply, the true mesh of clouds/sink, or sink_<count>.npy"
     ):
-        list(evaluation.source({"root": str(pairs)}).cases)
+        list(benchmark.source({"root": str(pairs)}).cases)
 
 
 # The command
@@ -390,7 +388,7 @@ def test_command_with_a_run(place: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert "random: 256 -> 512 points" in out
     assert "normals of the input estimated. CD: mean squared distances" in out
     assert "output: outputs/small/evaluation/synthetic/metrics.json" in out
-    assert out.endswith("next:   python -m pnu.compare 'methods=[outputs/small,apss]'\n")
+    assert out.endswith("next:   pnu compare 'methods=[outputs/small,apss]'\n")
     found = read_json(folder / "metrics.json")
     assert (found["subject"], found["ratio"], found["normals"], found["points"]) == (
         "outputs/small",
@@ -480,7 +478,7 @@ def test_command_warns_of_open_meshes_and_stops_at_other_frames(
 
 
 def test_command_as_users_start_it(place: Path) -> None:
-    command = [sys.executable, "-m", "pnu.evaluate", "method=nearest"]
+    command = [sys.executable, "-m", "pnu", "evaluate", "method=nearest"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "error: method=nearest: expected one of apss, poisson, midpoint\n"

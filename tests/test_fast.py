@@ -389,7 +389,7 @@ def test_the_switch_is_off_where_it_is_not_wanted(monkeypatch: pytest.MonkeyPatc
 
 
 def test_training_and_inference_are_fast(monkeypatch: pytest.MonkeyPatch) -> None:
-    from pnu.lit import UpsamplingModule
+    from pnu.training.lightning_module import UpsamplingModule
 
     module = UpsamplingModule(networks.build({"_target_": "pnu.networks.pnu.PNU"}), CompoundLoss())
     assert type(module.model.local_features.abstractions[0]) is forms.Abstraction

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pnu.ops.grouping import gather, interpolate
+from pnu.geometry.grouping import gather, interpolate
 from tests import reference
 
 

@@ -11,9 +11,9 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from pnu.inference import normals, upsample
 from pnu.networks.pnu import PNU
 from pnu.upsamplers import Context, Patches
+from pnu.upsamplers.whole_clouds import normals, upsample
 
 Array = np.ndarray
 
@@ -362,20 +362,12 @@ def test_points_and_normals_that_are_not_finite_are_left_out() -> None:
         assert ((dense[:, :3] * dense[:, 3:]).sum(1) < -0.8).all()  # estimated on the side of those that are given
 
 
-def test_public_function_survives_the_import_of_its_module() -> None:
-    code = (
-        "import pnu, pnu.inference as i; assert pnu.upsample is i.upsample; import pnu.upsample; pnu.upsample(points=1)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert "ValueError: points: expected an array (n, 3), or (n, 6) with normals, found shape ()" in done.stderr
-
-
 @pytest.mark.slow
 def test_hundred_thousand_points() -> None:
     code = """
 import numpy as np, resource
 from tests.test_inference import Spread, sphere
-from pnu.inference import upsample
+from pnu.upsamplers.whole_clouds import upsample
 points = sphere(100_000)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 assert upsample(points, points, model=Spread(patch_size=1024)).shape == (400_000, 6)

@@ -20,11 +20,11 @@ import torch
 import yaml
 
 import pnu
-from pnu.checkpoint import read
-from pnu.run import compose_config
-from pnu.run.build import GIVEN
-from pnu.run.schema import class_arguments
-from pnu.train import Train, main
+from pnu.commands.train import Train, main
+from pnu.config.compose import compose_config
+from pnu.config.instantiate import GIVEN
+from pnu.config.schema import class_arguments
+from pnu.networks.checkpoints import read
 from tests.commands import refused
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "lightning_hydra.md"

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset, Subset
 
-from pnu.lit import TRAINER_OPTIONS, NonFinite, UpsamplingModule, quieten
 from pnu.losses import CompoundLoss
 from pnu.metrics import chamfer_sq
+from pnu.training.lightning_module import TRAINER_OPTIONS, NonFinite, UpsamplingModule, quieten
 
 
 class Spread(nn.Module):

@@ -14,10 +14,10 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from pnu.fast import accelerate, terms
+from pnu.geometry.assignment import assign
+from pnu.geometry.grouping import gather
 from pnu.losses import compound as losses
 from pnu.losses.compound import CompoundLoss, Matches, search
-from pnu.ops.grouping import gather
-from pnu.ops.transport import assign
 
 TERMS = ("cd", "point_knn", "normal", "normal_orth", "normal_knn")
 

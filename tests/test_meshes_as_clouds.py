@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pnu.commands.upsample import main, sampled
 from pnu.io import CLOUD_SUFFIXES, OUTPUT_SUFFIXES, Mesh, check_output, read_cloud, read_mesh, write_mesh
-from pnu.upsample import main, sampled
 from tests.commands import refused
 from tests.test_io import CUBE, volume
 

@@ -14,9 +14,9 @@ from scipy.spatial.distance import directed_hausdorff
 from scipy.stats import wasserstein_distance_nd
 
 from pnu import metrics
+from pnu.geometry import mesh_sampling
 from pnu.io import Mesh, read_mesh
-from pnu.metrics import functional, modules, raycast
-from pnu.ops import surface
+from pnu.metrics import classes, functional, ray_casting
 
 SQUARE = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
 
@@ -31,7 +31,7 @@ def clouds(batch: int, n: int, *, seed: int = 0, dtype: torch.dtype = torch.floa
     return torch.as_tensor(values, dtype=dtype)
 
 
-@pytest.mark.parametrize("module", [functional, modules])
+@pytest.mark.parametrize("module", [functional, classes])
 def test_examples_in_docstrings_run(module: ModuleType) -> None:
     result = doctest.testmod(module, extraglobs={"torch": torch, "Mesh": Mesh})
     assert result.attempted > 10
@@ -213,7 +213,7 @@ def batches() -> list[tuple[torch.Tensor, torch.Tensor]]:
     return [(clouds(b, 40, seed=i), clouds(b, 40, seed=10 + i)) for i, b in enumerate(BATCHES)]
 
 
-def feed(metric: modules.CloudMean, pairs: list[tuple[torch.Tensor, torch.Tensor]]) -> np.ndarray:
+def feed(metric: classes.CloudMean, pairs: list[tuple[torch.Tensor, torch.Tensor]]) -> np.ndarray:
     for prediction, target in pairs:
         metric.update(prediction) if isinstance(metric, metrics.Spacing) else metric.update(prediction, target)
     result = metric.compute()
@@ -290,7 +290,7 @@ def test_equal_to_the_public_score_script(shared: Path, shape: str) -> None:
     expected = script.score(shape, cloud)
 
     # At edges the closest face is ambiguous, so the script's normal errors come back only with the script's search.
-    found = metrics.compare_mesh(cloud, mesh, closest=raycast.closest_points)
+    found = metrics.compare_mesh(cloud, mesh, closest=ray_casting.closest_points)
     scores = {
         "points": 5000,
         "CD": 1e3 * float(metrics.chamfer_sq(cloud, truth)),
@@ -304,10 +304,10 @@ def test_equal_to_the_public_score_script(shared: Path, shape: str) -> None:
     assert scores == pytest.approx(expected, rel=5e-5)
 
     # The exact search names another face for a few points only, and that face is as near.
-    _, distance, face = surface.closest_points(mesh, cloud[:, :3])
-    _, _, other = raycast.closest_points(mesh, cloud[:, :3])
+    _, distance, face = mesh_sampling.closest_points(mesh, cloud[:, :3])
+    _, _, other = ray_casting.closest_points(mesh, cloud[:, :3])
     differs = np.flatnonzero(face != other)
     assert len(differs) < 0.03 * len(cloud)
     for i in differs:
         single = Mesh(mesh.vertices, mesh.faces[other[i : i + 1]])
-        assert surface.closest_points(single, cloud[i : i + 1, :3])[1] == pytest.approx(distance[i], abs=1e-6)
+        assert mesh_sampling.closest_points(single, cloud[i : i + 1, :3])[1] == pytest.approx(distance[i], abs=1e-6)

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from pnu.ops import nearest as module
-from pnu.ops.nearest import Search, ball_query, knn, nearest
+from pnu.geometry import neighbor_search as module
+from pnu.geometry.neighbor_search import Search, ball_query, knn, nearest
 from tests import reference
 
 DTYPES = [torch.float32, torch.float64]
@@ -23,7 +23,7 @@ def cloud(clouds: int, n: int, *, seed: int, dtype: torch.dtype = torch.float64)
 def path(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """The tree of the CPU, and on the CPU what other devices take: kernels, chunks whole or a few rows at a time."""
     if request.param == "kernel":
-        kernels = pytest.importorskip("pnu.ops.kernels")
+        kernels = pytest.importorskip("pnu.geometry.triton_kernels")
         monkeypatch.setattr(module, "_knn_tree", partial(module._knn_kernel, kernels))
         monkeypatch.setattr(module, "_ball_tree", lambda q, t, *rest: kernels.ball_query(*module._single(q, t), *rest))
         monkeypatch.setattr(module, "CHUNK_ELEMENTS", 60)
@@ -98,7 +98,7 @@ def test_every_float_on_a_gpu_takes_the_kernels(dtype: torch.dtype, monkeypatch:
             found = module._knn_tree(query.as_subclass(Tensor), target.as_subclass(Tensor), k)
             return found.dist_sq, found.idx
 
-    monkeypatch.setattr("pnu.ops.kernels", Kernels("kernels"))
+    monkeypatch.setattr("pnu.geometry.triton_kernels", Kernels("kernels"))
     points = cloud(1, 30, seed=3, dtype=dtype)
     elsewhere = points.as_subclass(Elsewhere)
     found = knn(elsewhere, elsewhere, 4)

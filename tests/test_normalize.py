@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pnu.ops.normalize import unit_sphere_frame
+from pnu.geometry.unit_sphere import unit_sphere_frame
 
 BOTH = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 

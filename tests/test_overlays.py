@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
+from pnu.commands.train import Train, main
+from pnu.config.compose import check_keys, checked, compose_config, composer, config_folder, variations
 from pnu.data import shapes
 from pnu.io import write_mesh
-from pnu.run import compose_config
-from pnu.run.config import check_keys, checked, composer, config_folder, variations
-from pnu.run.sweep import parameters
-from pnu.train import Train, main
+from pnu.training.sweeps import parameters
 
 OVERLAYS = [
     f"{group}={path.relative_to(config_folder() / group).with_suffix('')}"

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from pnu import metrics
-from pnu.compare import main as compare
-from pnu.evaluate import main as evaluate
+from pnu.commands.compare import main as compare
+from pnu.commands.evaluate import main as evaluate
+from pnu.commands.report import main as report
+from pnu.commands.train import main as train
+from pnu.config.instantiate import find_metric
 from pnu.io import read_json
-from pnu.report import main as report
-from pnu.run import find_metric
-from pnu.train import main as train
 from tests.commands import refused
 from tests.test_train import patch_file  # noqa: F401  a fixture
 

@@ -15,8 +15,8 @@ import pytest
 from PIL import Image
 
 from pnu.io import Mesh
-from pnu.page import Column, Drawing, Row, Table, View, write_page
-from pnu.page.encode import RANGE, encode
+from pnu.report.offline_page import Column, Drawing, Row, Table, View, write_page
+from pnu.report.viewer_data import RANGE, encode
 from tests.test_surfaces import icosphere, sphere_points
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from pnu.checkpoint import load
-from pnu.inference import upsample
+from pnu.networks.checkpoints import load
 from pnu.networks.pnu import PNU
 from pnu.networks.surface import Surface
 from pnu.runtime.parts import Parts
 from pnu.upsamplers import patches as procedure
-from pnu.upsamplers import surface
+from pnu.upsamplers import surface_projection
+from pnu.upsamplers.whole_clouds import upsample
 
 
 class Stop(Exception):
@@ -33,7 +33,7 @@ def patches(size: int = 128) -> PNU:
 
 @pytest.mark.parametrize("model", ["surface", "patches"])
 def test_an_interrupted_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, model: str) -> None:
-    monkeypatch.setattr(surface, "KEPT", 1000)
+    monkeypatch.setattr(surface_projection, "KEPT", 1000)
     monkeypatch.setattr(procedure, "KEPT", 3)
     points = sphere(800)
     network = "surface" if model == "surface" else patches()

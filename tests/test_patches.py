@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pnu.ops.patches import extract, merge
+from pnu.geometry.patch_extraction import extract, merge
 from tests import reference
 
 

@@ -10,9 +10,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from pnu.data import shapes
-from pnu.data.patchset import build, check, cut_patches, describe, different
+from pnu.data.patch_file import build, check, cut_patches, describe, different
+from pnu.geometry.mesh_sampling import closest_points, face_normals
 from pnu.io import Mesh
-from pnu.ops.surface import closest_points, face_normals
 
 MAKERS = {name: functools.partial(shapes.make, name) for name in ("washer", "dice")}
 

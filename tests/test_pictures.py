@@ -7,14 +7,14 @@ import pytest
 import trimesh
 from PIL import Image
 
+from pnu.commands.picture import main as picture
+from pnu.geometry.mesh_topology import corner_normals, split_creases
+from pnu.geometry.spacing import spacing
 from pnu.io import Mesh
-from pnu.ops.colors import LMS, RGB, linear_light, normal_colors, srgb, value_colors
-from pnu.ops.mesh import corner_normals, split_creases
-from pnu.ops.spacing import spacing
-from pnu.picture import main as picture
-from pnu.pictures import Camera, ColorBar, figure, in_one_place, look_at, raster, render_cloud, render_mesh, save_png
-from pnu.pictures.figure import colorbar_figure, draw_colorbar, extent
-from pnu.pictures.render import in_front
+from pnu.rendering import Camera, ColorBar, figure, in_one_place, look_at, raster, render_cloud, render_mesh, save_png
+from pnu.rendering.colors import LMS, RGB, linear_light, normal_colors, srgb, value_colors
+from pnu.rendering.figure import colorbar_figure, draw_colorbar, extent
+from pnu.rendering.render import in_front
 
 FRONT = Camera(np.eye(3), np.zeros(3), 1.0)
 
@@ -52,7 +52,7 @@ def test_triangles_agree_with_every_pixel_against_every_triangle(monkeypatch: py
     corners = rng.uniform(-10, 50, (60, 3, 3))
     expected = slow_visible(corners, 40, 45)
     for chunk in (1 << 21, 50):  # in one go and in many small parts
-        monkeypatch.setattr("pnu.ops.chunks.CHUNK", chunk)
+        monkeypatch.setattr("pnu.geometry.ragged.CHUNK", chunk)
         found = raster.triangles(corners, 40, 45)
         picture = np.full(40 * 45, -1)
         picture[found.pixel] = found.primitive

@@ -1,4 +1,4 @@
-"""`python -m pnu.prepare`: cuts patches, describes files, refuses in one line."""
+"""`pnu prepare`: cuts patches, describes files, refuses in one line."""
 
 from pathlib import Path
 
@@ -6,11 +6,11 @@ import h5py
 import numpy as np
 import pytest
 
+from pnu.commands.prepare import main
 from pnu.data import shapes
-from pnu.data.datamodule import PatchDataModule
-from pnu.data.patchset import check
+from pnu.data.patch_file import check
+from pnu.data.patch_module import PatchDataModule
 from pnu.io import Mesh, write_mesh
-from pnu.prepare import main
 from tests.commands import refused
 
 

@@ -7,14 +7,14 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pnu.geometry.even_spacing import repel, tangent_discs
+from pnu.geometry.local_frames import feet, local_frames, tangent_basis
+from pnu.geometry.spacing import spacing
+from pnu.geometry.transforms import rotation_matrix
 from pnu.networks.surface import Projector, Surface
-from pnu.ops.frames import feet, local_frames, tangent_basis
-from pnu.ops.spacing import spacing
-from pnu.ops.spread import repel, tangent_discs
-from pnu.ops.transforms import rotation_matrix
 from pnu.upsamplers import Context, SurfaceProjection
-from pnu.upsamplers import surface as procedure
-from pnu.upsamplers.surface import reject_worst
+from pnu.upsamplers import surface_projection as procedure
+from pnu.upsamplers.surface_projection import reject_worst
 
 
 def upsample(network: Surface, cloud: Tensor, count: int, **options: Any) -> Tensor:
@@ -108,14 +108,14 @@ def test_seeds_fill_a_hole_between_the_points() -> None:
 
 def test_repulsion_evens_out_a_sphere() -> None:
     cloud = sphere(1500)
-    spread = repel(cloud[:, :3], cloud[:, 3:], steps=10)
+    even_spacing = repel(cloud[:, :3], cloud[:, 3:], steps=10)
 
     def unevenness(points: Tensor) -> float:
         near = torch.cdist(points, points).topk(2, largest=False).values[:, 1]
         return float(near.std() / near.mean())
 
-    assert unevenness(spread) < 0.5 * unevenness(cloud[:, :3])
-    assert (spread.norm(dim=1) - 1).abs().max() < 0.05
+    assert unevenness(even_spacing) < 0.5 * unevenness(cloud[:, :3])
+    assert (even_spacing.norm(dim=1) - 1).abs().max() < 0.05
 
 
 def test_repulsion_leaves_the_two_sides_of_a_sheet_alone() -> None:
@@ -325,12 +325,12 @@ def test_more_seeds_than_a_crop_can_bear_are_refused() -> None:
 
 
 def test_every_stage_of_a_large_run_moves(monkeypatch: pytest.MonkeyPatch) -> None:
-    from pnu.ops import sampling, spread
+    from pnu.geometry import even_spacing, sampling
 
     monkeypatch.setattr(procedure, "BATCHES", 1)
     monkeypatch.setattr(sampling, "LARGE", 2000)
     monkeypatch.setattr(sampling, "LARGE_BLOCK", 1000)
-    monkeypatch.setattr(spread, "ROWS", 1000)
+    monkeypatch.setattr(even_spacing, "ROWS", 1000)
     steps: dict[str, list[tuple[int, int]]] = {}
     upsample(Surface(), sphere(600), 2400, progress=lambda stage, *step: steps.setdefault(stage, []).append(step))
     stages = ["seeds", "spheres", "shortlist", "projection", "thinning", "even spacing", "refinement 1", "refinement 2"]
@@ -345,7 +345,7 @@ def test_every_stage_of_a_large_run_moves(monkeypatch: pytest.MonkeyPatch) -> No
 def test_no_holes_where_points_were_rejected() -> None:
     """Points of the true surface and the nearest point made, in spacings of the points made."""
     from bench.scale import wavy_sphere
-    from pnu.inference import upsample
+    from pnu.upsamplers.whole_clouds import upsample
 
     cloud = wavy_sphere(10_000)
     dense = cKDTree(upsample(cloud[:, :3], cloud[:, 3:], model="surface")[:, :3])

@@ -17,12 +17,13 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import pnu
-from pnu import evaluation, picture, reconstruct
+from pnu import benchmark
+from pnu.commands import picture, reconstruct
+from pnu.commands.doctor import open3d_error
+from pnu.commands.upsample import main as upsample_main
 from pnu.data import shapes
-from pnu.doctor import open3d_error
+from pnu.geometry.mesh_sampling import closest_points, sample_area
 from pnu.io import read_cloud, read_mesh, write_cloud
-from pnu.ops.surface import closest_points, sample_area
-from pnu.upsample import main as upsample_main
 
 Array = np.ndarray
 MESH = shapes.make("mug")
@@ -203,8 +204,8 @@ def test_any_cloud_gives_unit_normals_near_its_points(seed: int, n: int, ratio: 
 def measured(names: list[str]) -> dict[str, dict[str, float]]:
     """Metrics of the clouds of two meshes, taken in this order."""
     meshes = {name: (lambda name=name: shapes.make(name)) for name in names}
-    drawn = evaluation.mesh_cases(meshes, ["random"], points=200, truth_points=800, warn=lambda text: None)
-    return {case.truth.shape: evaluation.measure(np.hstack([case.points, case.normals]), case.truth) for case in drawn}
+    drawn = benchmark.mesh_cases(meshes, ["random"], points=200, truth_points=800, warn=lambda text: None)
+    return {case.truth.shape: benchmark.measure(np.hstack([case.points, case.normals]), case.truth) for case in drawn}
 
 
 def test_metrics_depend_neither_on_threads_nor_on_the_order_of_files() -> None:

@@ -7,21 +7,21 @@ from pathlib import Path
 
 import pytest
 
-from pnu.run import folder
-from pnu.run.provenance import machine, provenance, short_revision
+from pnu.runtime import provenance as provenance_of
+from pnu.runtime.provenance import machine, provenance, short_revision
 
 
 @pytest.fixture
 def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A repository with pnu/run/folder.py and docs/page.md, that the program seems to run from."""
-    for name in ("pnu/run/folder.py", "docs/page.md", ".gitignore"):
+    """A repository with pnu/runtime/provenance.py and docs/page.md, that the program seems to run from."""
+    for name in ("pnu/runtime/provenance.py", "docs/page.md", ".gitignore"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("*.pyc\n")
     monkeypatch.setenv("GIT_CONFIG_GLOBAL", "/dev/null")
     who = ["-c", "user.name=a", "-c", "user.email=a@b"]
     for command in (["init", "-q"], ["add", "-A"], [*who, "commit", "-q", "-m", "first"]):
         subprocess.run(["git", *command], cwd=tmp_path, check=True)
-    monkeypatch.setattr(folder, "__file__", str(tmp_path / "pnu/run/folder.py"))
+    monkeypatch.setattr(provenance_of, "__file__", str(tmp_path / "pnu/runtime/provenance.py"))
     return tmp_path
 
 
@@ -38,12 +38,12 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ],
 )
 def test_a_tree_with_files_that_count_is_not_clean(name: str, dirty: bool, checkout: Path) -> None:
-    clean = folder.git_revision()
+    clean = provenance.git_revision()
     assert clean is not None
     assert re.fullmatch("[0-9a-f]{40}", clean)
     (checkout / name).parent.mkdir(parents=True, exist_ok=True)
     (checkout / name).write_text("x")
-    assert folder.git_revision() == clean + "+" * dirty
+    assert provenance.git_revision() == clean + "+" * dirty
 
 
 def test_the_line_of_a_table() -> None:

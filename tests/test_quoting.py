@@ -1,4 +1,4 @@
-"""Every command that pnu prints is made by pnu.run.quoting, and runs when it is pasted, whatever the names are."""
+"""Every command that pnu prints is made by pnu.config.quoting, and runs when it is pasted, whatever the names are."""
 
 import ast
 import html
@@ -18,14 +18,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import pnu
+from pnu.commands.doctor import open3d_error
+from pnu.commands.upsample import Upsample
+from pnu.config.compose import compose_config, parse
+from pnu.config.quoting import hydra_text, override, quoted, shell_line, typed, typed_line
 from pnu.data import shapes
-from pnu.doctor import open3d_error
+from pnu.geometry.mesh_sampling import sample_area
 from pnu.io import read_cloud, write_cloud, write_json, write_mesh
-from pnu.ops.surface import sample_area
-from pnu.run import RunFolder, compose_config, shell_line, sweep
-from pnu.run.config import parse
-from pnu.run.quoting import hydra_text, override, quoted, typed, typed_line
-from pnu.upsample import Upsample
+from pnu.training import sweeps
+from pnu.training.run_folder import RunFolder
 from tests.test_docs import released_checkpoint
 from tests.test_train import patch_file  # noqa: F401  a fixture
 
@@ -49,7 +50,7 @@ def words(line: str) -> list[str]:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_name_arrives_as_it_is(name: str) -> None:
     python, option, module, argument, other = words(shell_line("upsample", input=name, output=[name, "x"]))
-    assert (python, option, module) == ("python", "-m", "pnu.upsample")
+    assert (python, option, module) == ("python", "-m", "pnu", "upsample")
     assert parse([argument])[0].value() == name
     assert parse([other])[0].value() == [name, "x"]
     if name:
@@ -110,7 +111,7 @@ def test_no_place_makes_a_command_without_quoting() -> None:
 
 def test_the_search_for_commands_finds_them(tmp_path: Path) -> None:
     path = tmp_path / "a.py"
-    path.write_text('"""python -m pnu.x"""\nprint(f"next: python -m pnu.upsample run={run}")\nx = "pnu-train run=a"\n')
+    path.write_text('"""pnu x"""\nprint(f"next: pnu upsample run={run}")\nx = "pnu-train run=a"\n')
     assert [bool(COMMAND.search(text)) for text in texts_of(path)] == [True, True]
 
 
@@ -281,7 +282,7 @@ def test_a_sweep_then_its_report(say: Say, trained: str) -> None:
     folder = Path(in_nasty("sweep"))
     folder.mkdir()
     Path(in_nasty("run")).rename(folder / "default_1")
-    closing = sweep.closing(folder)
+    closing = sweeps.closing(folder)
     report = say(printed(closing))
     (tensorboard,) = re.findall("curves: (.*)", report)
     assert words(tensorboard) == ["tensorboard", "--logdir", str(folder)]
@@ -291,7 +292,7 @@ def test_a_sweep_then_its_report(say: Say, trained: str) -> None:
     assert words(typed_before)[:4] == ["python", "-m", "pnu.train", "data=patches"]
     write_json(folder / "default_1" / "run.json", {"status": "failed"})
     with typed("train", ["-m", "seed=0,1"]):
-        assert printed(sweep.closing(folder)) == "python -m pnu.train -m seed=0,1"  # nothing to report on
+        assert printed(sweeps.closing(folder)) == "python -m pnu.train -m seed=0,1"  # nothing to report on
 
 
 def test_interrupted_before_anything_is_made(
@@ -301,7 +302,7 @@ def test_interrupted_before_anything_is_made(
         raise KeyboardInterrupt
 
     line = shell_line("upsample", input="cloud.ply", output=in_nasty("dense.ply"), run="surface")
-    monkeypatch.setattr("pnu.inference.upsample", stop)
+    monkeypatch.setattr("pnu.upsamplers.whole_clouds.upsample", stop)
     with pytest.raises(SystemExit) as stopped:
         say(line)
     assert stopped.value.code == 130

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pnu import picture, reconstruct
+from pnu.commands import picture, reconstruct
+from pnu.geometry.mesh_sampling import signed_volume
 from pnu.io import Mesh, read_cloud, read_json, read_mesh, write_cloud, write_mesh
-from pnu.ops.surface import signed_volume
 from tests import commands
 from tests.test_surfaces import icosphere, sphere_points
 

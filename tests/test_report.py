@@ -20,15 +20,15 @@ import pytest
 import yaml
 from PIL import Image
 
-from pnu.comparison.tables import tables
+from pnu.commands.report import main
+from pnu.commands.train import main as train
 from pnu.metrics import METRICS
-from pnu.page import write_page
-from pnu.report import main
-from pnu.study import collect, texts, write_report
-from pnu.study.plots import front, logarithmic, mean_curve, plots
-from pnu.study.settings import Setting, effects
-from pnu.study.texts import differing
-from pnu.train import main as train
+from pnu.report import sweep_report
+from pnu.report.comparison_tables import tables
+from pnu.report.offline_page import write_page
+from pnu.report.plots import front, logarithmic, mean_curve, plots
+from pnu.report.sweep_report import differing, write_report
+from pnu.report.sweep_results import Setting, collect, effects
 from tests.test_page import CHROMIUM, needs_browser
 from tests.test_train import patch_file  # noqa: F401  a fixture
 
@@ -101,7 +101,7 @@ def test_a_report_tells_revision_machine_and_seeds(make: Make) -> None:
         record = json.loads(path.read_text())
         path.write_text(json.dumps(record | {"git": "0123456789abcdef+", "machine": "Xeon, 2 threads"}))
     line = "Revision 0123456789+; Xeon, 2 threads; 2 to 3 seeds."
-    assert line in texts.facts(collect(folder))
+    assert line in sweep_report.facts(collect(folder))
     write_report(collect(folder), folder / "report")
     assert line in (folder / "report" / "report.md").read_text()
     assert line in (folder / "report" / "report.html").read_text()

@@ -14,12 +14,12 @@ import pytest
 from omegaconf import OmegaConf
 
 import pnu
-from pnu.run import RunFolder, build, command, compose_config, doc
-from pnu.run.command import renamed
-from pnu.run.config import composer, config_folder, flatten, variations
-from pnu.run.folder import config_hash, new_path
-from pnu.run.schema import check, fields, groups, known_keys, nearest_key, unsaid_keys
-from pnu.train import Train
+from pnu.commands._entry import command, renamed
+from pnu.commands.train import Train
+from pnu.config.compose import compose_config, composer, config_folder, flatten, variations
+from pnu.config.instantiate import build
+from pnu.config.schema import check, doc, fields, groups, known_keys, nearest_key, unsaid_keys
+from pnu.training.run_folder import RunFolder, config_hash, new_path
 
 COMMANDS = sorted(path.stem for path in config_folder().glob("*.yaml") if path.stem != "command")
 GROUPS = sorted(path.name for path in config_folder().iterdir() if path.is_dir())
@@ -171,7 +171,7 @@ def test_composing_leaves_hydra_as_it_was() -> None:
 
 SCRIPT = """
 from dataclasses import dataclass
-from pnu.run import command, doc
+from pnu.config import command, doc
 
 @dataclass
 class Upsample:
@@ -293,7 +293,7 @@ def test_help_lists_keys_values_and_documentation(script: Any) -> None:
 
 
 def test_main_takes_its_arguments_from_python_too(capsys: pytest.CaptureFixture[str]) -> None:
-    from pnu.train import main
+    from pnu.commands.train import main
 
     with pytest.raises(SystemExit) as stopped:
         main(["loss.w9=1"])

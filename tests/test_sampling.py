@@ -6,8 +6,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pnu.ops import sampling as module
-from pnu.ops.sampling import (
+from pnu.geometry import sampling as module
+from pnu.geometry.sampling import (
     farthest_points,
     farthest_points_large,
     nonuniform_points,

@@ -11,12 +11,11 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from pnu.run import compose_config
-from pnu.run.config import config_folder
-from pnu.run.help import help_text
-from pnu.run.schema import class_arguments, convert, library, settable, targets, type_name
-from pnu.run.signature import REQUIRED, Class, arguments, described, summary
-from pnu.train import Train
+from pnu.commands.train import Train
+from pnu.config.compose import compose_config, config_folder
+from pnu.config.help_text import help_text
+from pnu.config.schema import class_arguments, convert, library, settable, targets, type_name
+from pnu.config.signature import REQUIRED, Class, arguments, described, summary
 
 GROUPS = ("callbacks", "data", "logger", "loss", "model", "optimizer", "scheduler", "trainer")
 CLASSES = sorted(

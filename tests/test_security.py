@@ -14,9 +14,9 @@ import torch
 import yaml
 
 import pnu.io
-from pnu import checkpoint, evaluate
-from pnu.data import patchset, shapes
-from pnu.networks import build
+from pnu.commands import evaluate
+from pnu.data import patch_file, shapes
+from pnu.networks import build, checkpoints
 from tests.commands import refused
 
 PNU = {"_target_": "pnu.networks.pnu.PNU", "ratio": 2, "local_features": False}
@@ -82,14 +82,14 @@ ATTACKS = {
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    checkpoint.save(tmp_path / "run", build(PNU), PNU, {})
+    checkpoints.save(tmp_path / "run", build(PNU), PNU, {})
     return tmp_path / "run"
 
 
 def upsample(run: Path) -> subprocess.CompletedProcess[str]:
     points = np.random.default_rng(0).normal(size=(100, 3))
     np.savetxt(run.parent / "cloud.xyz", points / np.linalg.norm(points, axis=1, keepdims=True))
-    command = [sys.executable, "-m", "pnu.upsample", "input=cloud.xyz", "output=dense.xyz", f"run={run}", "ratio=2"]
+    command = [sys.executable, "-m", "pnu", "upsample", "input=cloud.xyz", "output=dense.xyz", f"run={run}", "ratio=2"]
     return subprocess.run(command, cwd=run.parent, capture_output=True, text=True, check=False)
 
 
@@ -173,10 +173,10 @@ def test_a_patch_file_opens_no_other_file(tmp_path: Path, trap: Path, kind: str)
         else:
             file["poisson_4096"], file["outside"] = cloud, outside
     if kind == "aside":
-        assert "outside (a link)" in patchset.describe(tmp_path / "patches.h5")["datasets"]
+        assert "outside (a link)" in patch_file.describe(tmp_path / "patches.h5")["datasets"]
         return
     with pytest.raises(ValueError, match=r"patches\.h5: poisson_4096 is a link or lies in another file"):
-        patchset.check(tmp_path / "patches.h5")
+        patch_file.check(tmp_path / "patches.h5")
 
 
 @pytest.mark.parametrize("name", ["mesh.obj", "mesh.ply"])

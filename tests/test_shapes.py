@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pnu.data import shapes
-from pnu.ops.mesh import open_edges
-from pnu.ops.surface import face_areas, signed_volume
+from pnu.geometry.mesh_sampling import face_areas, signed_volume
+from pnu.geometry.mesh_topology import open_edges
 
 made = functools.cache(shapes.make)
 

@@ -17,9 +17,9 @@ import torch
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from pnu.checkpoint import read
-from pnu.data import patchset, shapes
+from pnu.data import patch_file, shapes
 from pnu.io import read_cloud, write_mesh
+from pnu.networks.checkpoints import read
 from tests.test_cli import small  # noqa: F401  a fixture
 
 pytestmark = pytest.mark.slow
@@ -157,7 +157,7 @@ def test_prepare(tmp_path: Path) -> None:
     while kills < 5:
         kills += killed(start(tmp_path, "prepare", *line), moments(tmp_path / "data", rng, 6, writes=1))
         for path in (tmp_path / "data").glob("[!.]*"):
-            patchset.check(path)
+            patch_file.check(path)
             path.unlink()
     finish(tmp_path, "prepare", *line)
     finish(tmp_path, "prepare", *line, "data.cache=whole")

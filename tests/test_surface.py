@@ -5,8 +5,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from pnu.io import Mesh
-from pnu.ops.surface import (
+from pnu.geometry.mesh_sampling import (
     closest_points,
     face_areas,
     face_normals,
@@ -14,6 +13,7 @@ from pnu.ops.surface import (
     sample_poisson_disk,
     signed_volume,
 )
+from pnu.io import Mesh
 from tests import reference
 
 TETRAHEDRON = Mesh(

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnu import surfaces
+from pnu import reconstruction
+from pnu.geometry.mesh_sampling import signed_volume
+from pnu.geometry.mesh_topology import open_edges, vertex_normals
 from pnu.io import Mesh
-from pnu.ops.mesh import open_edges, vertex_normals
-from pnu.ops.surface import signed_volume
-from pnu.surfaces import poisson, poisson_child
+from pnu.reconstruction import poisson_process, screened_poisson
 
 
 def sphere_points(n: int, seed: int = 0) -> np.ndarray:
@@ -67,7 +67,7 @@ def icosphere(levels: int = 4) -> Mesh:
     ids=["sphere", "torus", "box"],
 )
 def test_exact_points_give_the_exact_volume(cloud: np.ndarray, volume: float, tolerance: float) -> None:
-    surface = surfaces.reconstruct(cloud[:, :3], cloud[:, 3:])
+    surface = reconstruction.reconstruct(cloud[:, :3], cloud[:, 3:])
     assert signed_volume(surface.mesh) == pytest.approx(volume, rel=tolerance)
     assert open_edges(surface.mesh) == 0
     assert not surface.inside_out
@@ -77,7 +77,7 @@ def test_exact_points_give_the_exact_volume(cloud: np.ndarray, volume: float, to
 def test_inward_normals_are_noticed_in_any_frame_and_the_surface_turned() -> None:
     cloud = sphere_points(1500)
     away = np.array([5e5, 4e6, -30])
-    surface = surfaces.reconstruct(100 * cloud[:, :3] + away, -7 * cloud[:, 3:])
+    surface = reconstruction.reconstruct(100 * cloud[:, :3] + away, -7 * cloud[:, 3:])
     assert surface.inside_out
     assert "inward" in surface.warnings()[0]
     assert signed_volume(surface.mesh) == pytest.approx(4 / 3 * np.pi * 1e6, rel=0.02)
@@ -87,7 +87,7 @@ def test_inward_normals_are_noticed_in_any_frame_and_the_surface_turned() -> Non
 def test_contradicting_normals_are_noticed() -> None:
     cloud = sphere_points(1500)
     cloud[np.random.default_rng(0).random(1500) < 0.2, 3:] *= -1
-    surface = surfaces.reconstruct(cloud[:, :3], cloud[:, 3:])
+    surface = reconstruction.reconstruct(cloud[:, :3], cloud[:, 3:])
     assert surface.contradicted == pytest.approx(0.2, abs=0.05)
     assert any("contradict the surface" in text for text in surface.warnings())
 
@@ -95,33 +95,33 @@ def test_contradicting_normals_are_noticed() -> None:
 def test_trimming_removes_the_bubble_around_an_open_surface() -> None:
     cloud = sphere_points(4000)
     half = cloud[cloud[:, 2] > 0]
-    surface = surfaces.reconstruct(half[:, :3], half[:, 3:])
+    surface = reconstruction.reconstruct(half[:, :3], half[:, 3:])
     below = surface.mesh.vertices[:, 2].min()
-    trimmed = surfaces.trim(surface, 0.1)
+    trimmed = reconstruction.trim(surface, 0.1)
     assert below < -0.1
     assert surface.made_up > 0.01
     assert trimmed.mesh.vertices[:, 2].min() > 0.5 * below
     assert 0.85 * len(surface.mesh.vertices) < len(trimmed.mesh.vertices) <= 0.9 * len(surface.mesh.vertices)
     assert trimmed.mesh.faces.max() == len(trimmed.mesh.vertices) - 1
     assert len(np.unique(trimmed.mesh.faces)) == len(trimmed.mesh.vertices) == len(trimmed.density)
-    same = surfaces.trim(surface, 0)
+    same = reconstruction.trim(surface, 0)
     assert len(same.mesh.faces) == len(surface.mesh.faces)
     with pytest.raises(ValueError, match=r"trim=1: expected a share"):
-        surfaces.trim(surface, 1)
+        reconstruction.trim(surface, 1)
 
 
 def test_same_input_same_mesh() -> None:
     cloud = sphere_points(500)
-    first, second = (surfaces.reconstruct(cloud[:, :3], cloud[:, 3:]) for _ in range(2))
+    first, second = (reconstruction.reconstruct(cloud[:, :3], cloud[:, 3:]) for _ in range(2))
     np.testing.assert_array_equal(first.mesh.vertices, second.mesh.vertices)
     np.testing.assert_array_equal(first.mesh.faces, second.mesh.faces)
 
 
 def test_depth_follows_the_spacing() -> None:
-    depths = [surfaces.octree_depth(sphere_points(n)[:, :3]) for n in (500, 2000, 8000, 32000)]
+    depths = [reconstruction.octree_depth(sphere_points(n)[:, :3]) for n in (500, 2000, 8000, 32000)]
     assert depths == [depths[0] + i for i in range(4)]
     assert 4 <= depths[0] <= 6
-    assert surfaces.octree_depth(1e3 * sphere_points(2000)[:, :3] + 7) == depths[1]
+    assert reconstruction.octree_depth(1e3 * sphere_points(2000)[:, :3] + 7) == depths[1]
 
 
 @pytest.mark.parametrize(
@@ -141,21 +141,21 @@ def test_child_may_fail_without_loss(
 ) -> None:
     fake = tmp_path / "child.py"
     fake.write_text(script)
-    monkeypatch.setattr(poisson_child, "__file__", str(fake))
+    monkeypatch.setattr(poisson_process, "__file__", str(fake))
     cloud = sphere_points(200)
     with pytest.raises(ValueError, match=message) as caught:
-        surfaces.reconstruct(cloud[:, :3], cloud[:, 3:], depth=6, timeout=30 if "sleep" not in script else 0.5)
+        reconstruction.reconstruct(cloud[:, :3], cloud[:, 3:], depth=6, timeout=30 if "sleep" not in script else 0.5)
     assert "\n" not in str(caught.value)
 
 
 def test_missing_open3d_has_its_own_exit_code(tmp_path: Path) -> None:
     (tmp_path / "open3d.py").write_text("raise ImportError('libGL.so.1: cannot open shared object file')")
-    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from pnu.surfaces import poisson_child as child; "
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from pnu.reconstruction import poisson_child as child; "
     run = subprocess.run(
         [sys.executable, "-c", code + "child.main('', '')"], capture_output=True, text=True, check=False
     )
-    assert run.returncode == poisson_child.CANNOT_IMPORT
-    assert "libGL.so.1" in poisson.failure(run.returncode, run.stderr, 8)
+    assert run.returncode == poisson_process.CANNOT_IMPORT
+    assert "libGL.so.1" in screened_poisson.failure(run.returncode, run.stderr, 8)
 
 
 @pytest.mark.parametrize(
@@ -170,13 +170,13 @@ def test_missing_open3d_has_its_own_exit_code(tmp_path: Path) -> None:
 def test_bad_input(change: dict, message: str) -> None:
     cloud = sphere_points(200)
     with pytest.raises(ValueError, match=message):
-        surfaces.reconstruct(**{"points": cloud[:, :3], "normals": cloud[:, 3:]} | change)
+        reconstruction.reconstruct(**{"points": cloud[:, :3], "normals": cloud[:, 3:]} | change)
 
 
 def test_errors_of_a_larger_sphere_are_its_distance() -> None:
     truth = icosphere()
     mesh = Mesh(1.1 * truth.vertices, truth.faces)
-    errors = surfaces.surface_errors(mesh, truth, rng=np.random.default_rng(0), samples=2000)
+    errors = reconstruction.surface_errors(mesh, truth, rng=np.random.default_rng(0), samples=2000)
     np.testing.assert_allclose(errors.distance, 0.1, atol=2e-3)
     np.testing.assert_allclose(errors.from_truth, 0.1, atol=3e-3)
     assert errors.normal_deg.max() < 6
@@ -187,36 +187,40 @@ def test_errors_of_a_larger_sphere_are_its_distance() -> None:
     assert summary["flipped"] == 0
     assert json.loads(json.dumps(summary)) == summary
     assert "100." in errors.table()
-    turned = surfaces.surface_errors(Mesh(mesh.vertices, mesh.faces[:, ::-1]), truth, rng=np.random.default_rng(0))
+    turned = reconstruction.surface_errors(
+        Mesh(mesh.vertices, mesh.faces[:, ::-1]), truth, rng=np.random.default_rng(0)
+    )
     assert turned.summary()["flipped"] == 1
 
 
 def test_errors_in_both_directions_see_a_missing_half() -> None:
     truth = icosphere()
     upper = truth.faces[(truth.vertices[truth.faces, 2] >= 0).all(1)]
-    errors = surfaces.surface_errors(Mesh(truth.vertices, upper), truth, rng=np.random.default_rng(0), samples=2000)
+    errors = reconstruction.surface_errors(
+        Mesh(truth.vertices, upper), truth, rng=np.random.default_rng(0), samples=2000
+    )
     assert errors.distance.max() < 1e-9
     assert errors.from_truth.max() == pytest.approx(np.sqrt(2), abs=0.05)  # from the lower pole to the equator
 
 
 def test_error_colours() -> None:
-    errors = surfaces.SurfaceErrors(np.array([0.0, 1, 2]), np.zeros(3), np.zeros(3), 1.0)
+    errors = reconstruction.SurfaceErrors(np.array([0.0, 1, 2]), np.zeros(3), np.zeros(3), 1.0)
     red, _, blue = errors.colors(limit=2).astype(int)
     assert red.argmax() == 0
     assert blue.argmax() == 2
-    flat = surfaces.SurfaceErrors(np.zeros(3), np.zeros(3), np.zeros(3), 1.0)
+    flat = reconstruction.SurfaceErrors(np.zeros(3), np.zeros(3), np.zeros(3), 1.0)
     assert (flat.colors()[:, 0] > 150).all()  # no error at all: red, and no division by zero
 
 
 def test_frames_are_compared() -> None:
     truth, points = icosphere(), sphere_points(500)[:, :3]
-    surfaces.check_frame(points, truth)
-    surfaces.check_frame(points + np.random.default_rng(0).normal(0, 0.02, points.shape), truth)
-    surfaces.check_frame(points[points[:, 2] > 0.5], truth)  # a part of it
+    reconstruction.check_frame(points, truth)
+    reconstruction.check_frame(points + np.random.default_rng(0).normal(0, 0.02, points.shape), truth)
+    reconstruction.check_frame(points[points[:, 2] > 0.5], truth)  # a part of it
     with pytest.raises(ValueError, match=r"truth: is not in the frame of cloud.*99\.8 times as large"):
-        surfaces.check_frame(100 * points, truth)
+        reconstruction.check_frame(100 * points, truth)
     with pytest.raises(ValueError, match=r"middles 0\.496 apart"):
-        surfaces.check_frame(points + np.array([0, 0, 0.5]), truth)
+        reconstruction.check_frame(points + np.array([0, 0, 0.5]), truth)
 
 
 def test_open_edges() -> None:
@@ -240,6 +244,6 @@ def test_vertex_normals() -> None:
 def test_interpolate() -> None:
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [9, 9, 9]])
     values = np.arange(10.0).reshape(5, 2)
-    np.testing.assert_allclose(surfaces.interpolate(points, values, points), values, atol=1e-6)
-    middle = surfaces.interpolate(points, values, np.array([[0.5, 0, 0]]), k=2)
+    np.testing.assert_allclose(reconstruction.interpolate(points, values, points), values, atol=1e-6)
+    middle = reconstruction.interpolate(points, values, np.array([[0.5, 0, 0]]), k=2)
     np.testing.assert_allclose(middle, [[1, 2]], atol=1e-6)

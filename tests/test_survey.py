@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pnu.ops.survey import survey
+from pnu.geometry.cloud_statistics import survey
 
 RNG = np.random.default_rng(0)
 

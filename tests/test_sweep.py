@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 import yaml
 
+from pnu.commands.train import Train, main
+from pnu.config.compose import compose_config, composer, config_folder
+from pnu.config.schema import check
 from pnu.io import read_json, write_json
-from pnu.run import RunFolder, compose_config
-from pnu.run.config import composer, config_folder
-from pnu.run.schema import check
-from pnu.run.sweep import arguments, check_job, label_of, sweep_name
-from pnu.train import Train, main
+from pnu.training.run_folder import RunFolder
+from pnu.training.sweeps import arguments, check_job, label_of, sweep_name
 from tests.test_train import patch_file  # noqa: F401  a fixture
 
 ABLATIONS = sorted(path.stem for path in (config_folder() / "ablation").glob("*.yaml"))
@@ -113,7 +113,7 @@ def test_full_scale_is_the_papers() -> None:
 def test_sampling_compares_on_the_same_clouds(patch_file: Path) -> None:  # noqa: F811
     import torch
 
-    from pnu.data.datamodule import PatchDataModule
+    from pnu.data.patch_module import PatchDataModule
 
     def batch(part: str, **options: str) -> torch.Tensor:
         data = PatchDataModule(str(patch_file), batch_size=2, input_points=64, target_points=256, **options)
@@ -241,7 +241,7 @@ def test_killed_in_the_middle_and_started_again(
     resumed = next(record for name, record in after.items() if name.startswith("cd"))
     assert len(resumed["resumed"]) == 1
 
-    from pnu.report import main as report
+    from pnu.commands.report import main as report
 
     report([f"sweep={folder}", "quiet=true"])
     text = (folder / "report" / "report.md").read_text()
@@ -256,7 +256,7 @@ def test_a_job_that_runs_is_left_alone(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    from pnu.run.sweep import locked
+    from pnu.training.sweeps import locked
 
     monkeypatch.chdir(tmp_path)
     line = [*small(patch_file), "setting=default", "seed=0,1", "sweep=s"]
@@ -298,7 +298,7 @@ def test_a_failing_job_is_told_at_once_and_the_others_go_on(
     states = [record["status"] for record in records(tmp_path / "outputs/sweeps/s").values()]
     assert sorted(states) == ["failed", "finished"]
 
-    from pnu.report import main as report
+    from pnu.commands.report import main as report
 
     report(["sweep=outputs/sweeps/s"])
     assert "1 unfinished" in capsys.readouterr().out
@@ -344,7 +344,7 @@ def test_interrupted_with_a_launcher(launcher: str, whom: str, patch_file: Path,
 
 
 def test_a_job_whose_process_is_gone_does_not_run(tmp_path: Path) -> None:
-    from pnu.run.sweep import closing, locked, record_interruptions, state
+    from pnu.training.sweeps import closing, locked, record_interruptions, state
 
     run = RunFolder(tmp_path / "default_1")
     run.path.mkdir()
@@ -431,7 +431,7 @@ def test_what_is_left_of_a_search(tmp_path: Path) -> None:
     import optuna
     from omegaconf import OmegaConf
 
-    from pnu.run.search import arguments
+    from pnu.training.optuna_search import arguments
 
     storage = f"sqlite:///{tmp_path}/optuna.db"
     sweeper = {

@@ -5,10 +5,10 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from pnu.ops import sampling
-from pnu.ops.blocks import along_curve, split
-from pnu.ops.sampling import farthest_points_large
-from pnu.ops.thinning import farthest_in_blocks
+from pnu.geometry import sampling
+from pnu.geometry.farthest_blocks import farthest_in_blocks
+from pnu.geometry.sampling import farthest_points_large
+from pnu.geometry.spatial_blocks import along_curve, split
 
 SIZE = 2**12  # of a block
 
@@ -103,7 +103,7 @@ def test_large_clouds_take_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     points = sphere(10_000)
     exact = farthest_points_large(points, 3000)
     monkeypatch.setattr(sampling, "LARGE", 5000)
-    monkeypatch.setattr("pnu.ops.thinning.BLOCK", SIZE)
+    monkeypatch.setattr("pnu.geometry.farthest_blocks.BLOCK", SIZE)
     chosen = farthest_points_large(torch.from_numpy(points).double() + 1e6, 3000)
     assert len(np.unique(chosen)) == 3000
     assert spacing(points[chosen]).mean() == pytest.approx(spacing(points[exact]).mean(), rel=0.01)

@@ -18,11 +18,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch import Tensor
 
 import pnu
-from pnu import callbacks
-from pnu.checkpoint import newest_run, read
-from pnu.run.config import config_folder
-from pnu.run.sweep import locked
-from pnu.train import main
+from pnu.commands.train import main
+from pnu.config.compose import config_folder
+from pnu.networks.checkpoints import newest_run, read
+from pnu.training import callbacks
+from pnu.training.sweeps import locked
 from tests.commands import refused
 
 Train = Callable[..., Path]
@@ -104,7 +104,7 @@ def test_hydras_folder_is_the_run_folder(train: Train, tmp_path: Path, capsys: p
 
 
 def test_hydras_folder_is_none_of_other_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from pnu.upsample import main as upsample
+    from pnu.commands.upsample import main as upsample
 
     error = refused(capsys, upsample, ["input=a.ply", "output=b.ply", f"hydra.run.dir={tmp_path}/x"])
     assert "this command makes no run folder; its files are named by its keys" in error
@@ -260,7 +260,7 @@ def test_the_end_tells_what_came_out_and_how_to_go_on(train: Train, capsys: pyte
         "\nuntrained and best validation: on the validation's shapes; test: on other shapes, with the network of" in out
     )
     assert f"run folder: {run}" in out
-    assert f"next: python -m pnu.upsample input=cloud.ply output=dense.ply run={run}" in out
+    assert f"next: pnu upsample input=cloud.ply output=dense.ply run={run}" in out
 
 
 def test_quiet_prints_the_folder_alone(train: Train, capsys: pytest.CaptureFixture[str]) -> None:
@@ -474,7 +474,7 @@ def test_a_checkpoint_that_cannot_be_written_is_no_success(
 
     run = train("trainer.max_steps=2")
     before = (run / "checkpoints/last.ckpt").read_bytes()
-    monkeypatch.setattr("pnu.callbacks.write", write)
+    monkeypatch.setattr("pnu.training.callbacks.write", write)
     with pytest.raises(SystemExit) as stopped:
         resume(run, "trainer.max_steps=3")
     assert stopped.value.code == 2

@@ -6,12 +6,12 @@ import pytest
 import yaml
 
 from pnu import weights
-from pnu.compare import main, upsamplers
+from pnu.benchmark import source
+from pnu.benchmark.trained_shapes import Trained, of_card, trained_on
+from pnu.commands.compare import main, upsamplers
 from pnu.data import shapes
-from pnu.evaluation import source
-from pnu.evaluation.trained import Trained, of_card, trained_on
 from pnu.io import write_mesh
-from pnu.run.folder import run_name
+from pnu.training.run_folder import run_name
 from tests.test_surfaces import icosphere
 
 SYNTHETIC = {"_target_": "x", "kinds": ["organic", "cad"], "val_share": 0.1, "test_share": 0.1}
@@ -81,8 +81,8 @@ def test_names_of_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folders = [tmp_path / "12-30-01_wide", tmp_path / "12-31-01_wide", tmp_path / "12-32-01_deep"]
     for folder in folders:
         folder.mkdir()
-    monkeypatch.setattr("pnu.checkpoint.load", lambda folder: None)
-    monkeypatch.setattr("pnu.evaluation.network_upsampler", lambda *args, **options: None)
+    monkeypatch.setattr("pnu.networks.checkpoints.load", lambda folder: None)
+    monkeypatch.setattr("pnu.benchmark.network_upsampler", lambda *args, **options: None)
     from omegaconf import OmegaConf
 
     keys = {"ratio": 4, "passes": False, "batch_size": None, "device": "cpu", "seed": 0}

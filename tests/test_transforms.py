@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pnu.ops.transforms import affine, rotate, rotation_matrix, scale, small_rotation, translate
+from pnu.geometry.transforms import affine, rotate, rotation_matrix, scale, small_rotation, translate
 
 
 def generator(seed: int = 0) -> torch.Generator:

@@ -1,4 +1,4 @@
-"""`python -m pnu.upsample` on real files."""
+"""`pnu upsample` on real files."""
 
 import importlib
 import subprocess
@@ -40,7 +40,7 @@ def place(tmp_path: Path) -> Path:
 
 
 def upsample(place: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "pnu.upsample", *arguments]
+    command = [sys.executable, "-m", "pnu", "upsample", *arguments]
     return subprocess.run(command, cwd=place, capture_output=True, text=True, check=False, timeout=120)
 
 
@@ -57,7 +57,7 @@ def test_newest_run_and_report(place: Path) -> None:
     assert lines[1].startswith("        spacing ")
     assert lines[2] == "run:    outputs/2026-01-02/03-04-05_small (the newest finished one)"
     assert lines[3].startswith("output: dense.xyz, 700 points with unit normals, ")
-    assert lines[4] == "next:   python -m pnu.reconstruct input=dense.xyz output=mesh.ply"
+    assert lines[4] == "next:   pnu reconstruct input=dense.xyz output=mesh.ply"
     assert "farthest points" in done.stderr
 
 
@@ -108,7 +108,7 @@ BAD = {
 def test_bad_input_is_one_line_and_leaves_nothing(
     place: Path, case: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from pnu.upsample import main
+    from pnu.commands.upsample import main
 
     (place / "empty.ply").touch()
     np.savetxt(place / "two.txt", np.ones((20, 2)))
@@ -126,7 +126,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
 
 
 def test_no_newest_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    from pnu.upsample import main
+    from pnu.commands.upsample import main
 
     monkeypatch.chdir(tmp_path)
     np.save("cloud.npy", np.random.default_rng(0).normal(size=(100, 3)))
@@ -154,7 +154,7 @@ def test_the_default_is_what_comes_with_pnu(
 ) -> None:
     """Whatever was trained in this folder, from the command line and from Python."""
     import pnu
-    from pnu.upsample import main
+    from pnu.commands.upsample import main
 
     monkeypatch.chdir(place)
     points, normals, *_ = read_cloud(place / "cloud.ply")

@@ -8,9 +8,9 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from pnu import inference, metrics
+from pnu import metrics
 from pnu.io import read_cloud, read_mesh
-from pnu.upsamplers import APSS, Context, Midpoint, classical
+from pnu.upsamplers import APSS, Context, Midpoint, classical, whole_clouds
 
 FAST = ("apss", "midpoint")
 
@@ -28,7 +28,7 @@ def sphere(n: int, seed: int = 0) -> np.ndarray:
 @pytest.mark.parametrize("name", FAST)
 def test_count_frame_and_normals(name: str, ratio: float) -> None:
     normals = sphere(300)
-    dense = inference.upsample(50 * normals + 1e5, normals, ratio=ratio, model=classical(name))
+    dense = whole_clouds.upsample(50 * normals + 1e5, normals, ratio=ratio, model=classical(name))
     assert dense.shape == (round(300 * ratio), 6)
     assert len(np.unique(dense[:, :3], axis=0)) == len(dense)
     offset = (dense[:, :3] - 1e5) / 50
@@ -46,7 +46,7 @@ def test_count_frame_and_normals(name: str, ratio: float) -> None:
 def test_seed(name: str) -> None:
     normals = sphere(200)
     one, same, other = (
-        inference.upsample(normals, normals, ratio=3, model=classical(name), seed=seed) for seed in (0, 0, 1)
+        whole_clouds.upsample(normals, normals, ratio=3, model=classical(name), seed=seed) for seed in (0, 0, 1)
     )
     np.testing.assert_array_equal(one, same)
     assert np.array_equal(one, other) == (name == "midpoint")
@@ -54,7 +54,7 @@ def test_seed(name: str) -> None:
 
 @pytest.mark.parametrize("name", FAST)
 def test_without_normals(name: str) -> None:
-    dense = inference.upsample(sphere(500), ratio=2, model=classical(name))
+    dense = whole_clouds.upsample(sphere(500), ratio=2, model=classical(name))
     assert (dense[:, :3] * dense[:, 3:]).sum(1).min() > 0.8
 
 
@@ -80,14 +80,14 @@ def test_midpoints_by_hand() -> None:
 def test_apss_fills_a_hole_of_the_sampling() -> None:
     normals = sphere(1500)
     normals = normals[normals[:, 2] < np.cos(0.12)]  # a hole of three spacings
-    dense = inference.upsample(normals, normals, ratio=4, model=classical("apss"))
+    dense = whole_clouds.upsample(normals, normals, ratio=4, model=classical("apss"))
     assert cKDTree(dense[:, :3]).query([0, 0, 1])[0] < 0.08 < cKDTree(normals).query([0, 0, 1])[0]
 
 
 def test_poisson_surface() -> None:
     pytest.importorskip("open3d")
     normals = sphere(2000)
-    dense = inference.upsample(normals, normals, ratio=2, model=classical("poisson"))
+    dense = whole_clouds.upsample(normals, normals, ratio=2, model=classical("poisson"))
     assert dense.shape == (4000, 6)
     np.testing.assert_allclose(np.linalg.norm(dense[:, :3], axis=1), 1, atol=0.01)
     assert (dense[:, :3] * dense[:, 3:]).sum(1).min() > 0.98
@@ -98,15 +98,15 @@ def test_poisson_makes_no_bubble_at_an_open_border() -> None:
     pytest.importorskip("open3d")
     normals = sphere(4000)
     normals = normals[normals[:, 2] > 0]
-    dense = inference.upsample(normals, normals, ratio=2, model=classical("poisson"))
+    dense = whole_clouds.upsample(normals, normals, ratio=2, model=classical("poisson"))
     assert cKDTree(normals).query(dense[:, :3])[0].max() < 0.25
 
 
 @pytest.mark.parametrize("name", FAST)
 def test_names_are_models(name: str) -> None:
     normals = sphere(100)
-    dense = inference.upsample(normals, normals, model=name)
-    np.testing.assert_array_equal(dense, inference.upsample(normals, normals, model=classical(name)))
+    dense = whole_clouds.upsample(normals, normals, model=name)
+    np.testing.assert_array_equal(dense, whole_clouds.upsample(normals, normals, model=classical(name)))
 
 
 @pytest.mark.parametrize("make", [lambda: Midpoint(0), lambda: APSS(3), lambda: APSS(seeds=1), lambda: APSS(reach=1)])
@@ -126,7 +126,7 @@ def test_apss_is_as_good_as_known(shared: Path) -> None:
     found = []
     for shape in ("casting", "duck", "fandisk", "camel", "elephant", "kitten"):
         points, normals, *_ = read_cloud(shared / "bench" / "clouds" / f"{shape}.xyz")
-        dense = inference.upsample(points, normals, model=classical("apss"))
+        dense = whole_clouds.upsample(points, normals, model=classical("apss"))
         truth = np.load(shared / "bench" / "truth" / f"{shape}_20000.npy")
         close = metrics.compare_mesh(dense, read_mesh(shared / "bench" / "truth" / f"{shape}.ply"))
         far = metrics.compare(dense, truth)

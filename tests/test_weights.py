@@ -7,8 +7,9 @@ import torch
 from safetensors.torch import save_file
 
 import pnu
-from pnu import checkpoint, weights
-from pnu.export import main
+from pnu import weights
+from pnu.commands.export import main
+from pnu.networks import checkpoints
 from pnu.networks.surface import Surface
 
 MODEL = {"_target_": "pnu.networks.surface.Surface", "neighbours": 12, "reach": 12, "width": 16}
@@ -19,13 +20,13 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A working folder with a run."""
     monkeypatch.chdir(tmp_path)
     torch.manual_seed(0)
-    checkpoint.save(tmp_path / "run", Surface(neighbours=12, reach=12, width=16), MODEL, {})
+    checkpoints.save(tmp_path / "run", Surface(neighbours=12, reach=12, width=16), MODEL, {})
     return tmp_path
 
 
 def test_exported_weights_are_those_of_the_run(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(["run=run", "output=small.safetensors"])
-    assert capsys.readouterr().out.splitlines()[1].startswith("next:   python -m pnu.upsample run=small.safetensors")
+    assert capsys.readouterr().out.splitlines()[1].startswith("next:   pnu upsample run=small.safetensors")
     ours, theirs = pnu.load("run"), pnu.load("small.safetensors")
     assert isinstance(theirs, Surface)
     assert not theirs.training

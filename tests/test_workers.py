@@ -14,10 +14,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from pnu.inference import upsample
 from pnu.runtime.workers import InProcess, Processes
-from pnu.upsamplers import APSS, surface
+from pnu.upsamplers import APSS, surface_projection
 from pnu.upsamplers import patches as procedure
+from pnu.upsamplers.whole_clouds import upsample
 from tests.test_parts import patches, sphere
 
 CLOUD = torch.arange(12.0, dtype=torch.float64).view(4, 3)
@@ -62,7 +62,7 @@ def test_order_errors_and_end() -> None:
 @pytest.mark.parametrize("devices", [2, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("model", ["surface", pytest.param("patches", marks=pytest.mark.slow)])
 def test_the_number_of_devices_does_not_matter(model: str, devices: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(surface, "BATCHES", 1)  # many parts
+    monkeypatch.setattr(surface_projection, "BATCHES", 1)  # many parts
     monkeypatch.setattr(procedure, "BATCHES", 2)
     points, network = sphere(1000), "surface" if model == "surface" else patches(64)
     one, several = (
@@ -82,7 +82,7 @@ def test_what_cannot_be_shared() -> None:
 SCRIPT = """
 import sys
 import torch
-from pnu.inference import upsample
+from pnu.upsamplers.whole_clouds import upsample
 from tests.test_workers import sphere
 def say(stage, done, total):
     if stage == "projection" and done:

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnu.ops.transforms import rotate, rotation_matrix, scale, small_rotation, translate
+from pnu.geometry.transforms import rotate, rotation_matrix, scale, small_rotation, translate
 
 
 class Augmentation:

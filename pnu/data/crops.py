@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from pnu.geometry.mesh_sampling import sample_area, sample_poisson_disk
+from pnu.geometry.normal_estimation import estimate_normals, refit_normals
+from pnu.geometry.sampling import farthest_points_large
 from pnu.io import Mesh
-from pnu.ops.normals import estimate_normals, refit_normals
-from pnu.ops.sampling import farthest_points_large
-from pnu.ops.surface import sample_area, sample_poisson_disk
 
 SIZES = (600, 8000)  # points of a cloud, evenly spread in the logarithm, for half of the clouds
 USUAL = (1500, 6500)  # and for the other half

@@ -1,7 +1,7 @@
 """Losses: `loss(prediction, target, extra)` gives every term by name and their weighted sum as "loss"."""
 
 from pnu.losses.compound import CompoundLoss
+from pnu.losses.projection import SurfaceLoss
 from pnu.losses.rivals import EdgeAwareLoss, ParameterizationLoss, RepulsionLoss
-from pnu.losses.surface import SurfaceLoss
 
 __all__ = ["CompoundLoss", "EdgeAwareLoss", "ParameterizationLoss", "RepulsionLoss", "SurfaceLoss"]

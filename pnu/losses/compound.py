@@ -13,9 +13,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pnu.ops.grouping import gather
-from pnu.ops.nearest import knn, nearest
-from pnu.ops.transport import assign
+from pnu.geometry.assignment import assign
+from pnu.geometry.grouping import gather
+from pnu.geometry.neighbor_search import knn, nearest
 
 Reduction = Literal["mean", "sum"]
 ORDER = ("cd", "emd", "point_knn", "normal", "normal_orth", "normal_knn")

@@ -9,9 +9,9 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from pnu.geometry.grouping import gather
+from pnu.geometry.neighbor_search import knn, nearest
 from pnu.losses.compound import chamfer, emd, search
-from pnu.ops.grouping import gather
-from pnu.ops.nearest import knn, nearest
 
 DENSE = 4096  # target points for which the papers give reaches; with fewer the reach grows as their spacing does
 

@@ -22,7 +22,7 @@ from pnu.metrics.functional import (
 from pnu.metrics.metric import METRICS, Metric, Shown, compare, compare_mesh, measured, with_own
 
 if TYPE_CHECKING:
-    from pnu.metrics.modules import (
+    from pnu.metrics.classes import (
         ChamferDistance,
         CloudMetrics,
         EarthMoverDistance,
@@ -67,7 +67,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """Import the torchmetrics classes on first use."""
     if name in __all__:
-        from pnu.metrics import modules
+        from pnu.metrics import classes
 
-        return getattr(modules, name)
+        return getattr(classes, name)
     raise AttributeError(f"module 'pnu.metrics' has no attribute {name!r}")

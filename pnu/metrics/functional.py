@@ -19,9 +19,9 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pnu.geometry.mesh_sampling import closest_points, face_normals
+from pnu.geometry.neighbor_search import Neighbors, knn, nearest
 from pnu.io import Mesh
-from pnu.ops.nearest import Neighbors, knn, nearest
-from pnu.ops.surface import closest_points, face_normals
 
 EMD_LIMIT = 4096
 

@@ -10,10 +10,10 @@ import numpy as np  # noqa: F401  the examples
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from pnu.geometry.mesh_sampling import closest_points
 from pnu.io import Mesh
 from pnu.metrics import functional
 from pnu.metrics.functional import ClosestPoints, Pair
-from pnu.ops.surface import closest_points
 
 
 class Shown(NamedTuple):

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from pnu.geometry.grouping import gather, interpolate
+from pnu.geometry.neighbor_search import ball_query
 from pnu.networks.norm import BatchNorm
-from pnu.ops.grouping import gather, interpolate
-from pnu.ops.nearest import ball_query
 
 
 class Layer(nn.Module):

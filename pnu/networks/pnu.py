@@ -6,9 +6,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from pnu.geometry.grouping import gather
+from pnu.geometry.sampling import farthest_points
 from pnu.networks.layers import MLP, Abstraction, JoinedMLP, PooledMLP, Propagation, expand
-from pnu.ops.grouping import gather
-from pnu.ops.sampling import farthest_points
 
 RADII = (0.1, 0.2, 0.3, 0.4)
 MINIMUM = 64  # points of a patch: the coarsest level keeps one in 64

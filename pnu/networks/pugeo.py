@@ -3,11 +3,11 @@
 import torch
 from torch import Tensor, nn
 
+from pnu.geometry.grouping import gather
+from pnu.geometry.neighbor_search import knn
 from pnu.networks.layers import MLP
 from pnu.networks.norm import BatchNorm
 from pnu.networks.punet import check_ratio, coordinates
-from pnu.ops.grouping import gather
-from pnu.ops.nearest import knn
 
 NEIGHBORS = 20
 WIDTHS = (64, 64, 128, 128)

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from pnu.geometry.grouping import gather, interpolate
+from pnu.geometry.sampling import farthest_points
 from pnu.networks.layers import MLP, Abstraction
-from pnu.ops.grouping import gather, interpolate
-from pnu.ops.sampling import farthest_points
 
 RADII = (0.05, 0.1, 0.2, 0.3)
 MINIMUM = 64

@@ -1,19 +1,19 @@
 """Learned surface projection: points near a cloud are moved onto the surface that it samples.
 
-A query sees its nearest input points with their normals in a local frame (`pnu.ops.frames`). An algebraic sphere gives
-a first foot and normal; a small network shared by all neighbours, with maximum and attention pooling, corrects both.
-How clouds become dense with it, is in `pnu.upsamplers.surface`.
+A query sees its nearest input points with their normals in a local frame (`pnu.geometry.local_frames`). An algebraic
+sphere gives a first foot and normal; a small network shared by all neighbours, with maximum and attention pooling,
+corrects both. How clouds become dense with it, is in `pnu.upsamplers.surface_projection`.
 """
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear, normalize
 
-from pnu.ops.frames import FEATURES, local_frames
-from pnu.ops.grouping import gather
-from pnu.ops.nearest import knn
-from pnu.ops.sampling import farthest_points
-from pnu.ops.spread import tangent_discs
+from pnu.geometry.even_spacing import tangent_discs
+from pnu.geometry.grouping import gather
+from pnu.geometry.local_frames import FEATURES, local_frames
+from pnu.geometry.neighbor_search import knn
+from pnu.geometry.sampling import farthest_points
 
 EACH = 3  # seeds of a point, in training, before they are thinned out
 PUSH = 0.1  # between rounds of training, beside the way from its point to a seed
@@ -181,5 +181,5 @@ class Surface(nn.Module):
         return [rank for rank in [*range(min(DENSE, self.neighbours)), *far] if rank < n]
 
     def forward(self, patch: Tensor) -> Tensor:
-        """As in training: patch (B, n, 6) -> (B, queries, 6). Whole clouds are for `pnu.upsamplers.surface`."""
+        """As in training: patch (B, n, 6) -> (B, queries, 6). Whole clouds: `pnu.upsamplers.surface_projection`."""
         return self.outputs(patch)["prediction"]

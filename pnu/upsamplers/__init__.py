@@ -5,13 +5,13 @@ surface     seeds, spheres, learned projection, even spacing, rejection, for net
 apss, poisson, midpoint     without a network
 """
 
-from pnu.upsamplers.apss import APSS
 from pnu.upsamplers.context import Context, Upsampler
-from pnu.upsamplers.midpoint import Midpoint
+from pnu.upsamplers.midpoints import Midpoint
 from pnu.upsamplers.patches import Patches
-from pnu.upsamplers.poisson import PoissonSurface
+from pnu.upsamplers.point_set_surface import APSS
+from pnu.upsamplers.poisson_samples import PoissonSurface
 from pnu.upsamplers.selection import CLASSICAL, classical, dense_patches, upsampler_of
-from pnu.upsamplers.surface import SurfaceProjection
+from pnu.upsamplers.surface_projection import SurfaceProjection
 
 __all__ = [
     "APSS",

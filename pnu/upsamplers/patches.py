@@ -7,10 +7,10 @@ from numbers import Integral
 import torch
 from torch import Tensor, nn
 
-from pnu.ops import patches
-from pnu.ops.nearest import nearest
-from pnu.ops.normalize import unit_sphere_frame
-from pnu.ops.normals import estimate_normals, flip_to_reference
+from pnu.geometry import patch_extraction
+from pnu.geometry.neighbor_search import nearest
+from pnu.geometry.normal_estimation import estimate_normals, flip_to_reference
+from pnu.geometry.unit_sphere import unit_sphere_frame
 from pnu.runtime import threads
 from pnu.runtime.workers import Begin, InProcess, Work, Workers
 from pnu.upsamplers.context import Context
@@ -82,7 +82,7 @@ class Patches:
         centers = 1 if size == n else max(1, round(self.ratio * n / size))
         stage = f"network, {n} points"
         context.progress(stage, 0, centers)
-        idx = patches.extract(cloud, centers, size, cover=True)
+        idx = patch_extraction.extract(cloud, centers, size, cover=True)
         if size < SMALLEST_PATCH:
             idx = idx[:, torch.arange(SMALLEST_PATCH) % size]
         like = example(self.network)
@@ -104,7 +104,7 @@ class Patches:
             predicted[first * each : first * each + len(found)] = found
         context.progress(stage, len(idx), len(idx))
         stage = f"farthest points, {count} of {len(predicted)}"
-        return patches.merge(_finite(predicted)[None], count, partial(context.progress, stage))
+        return patch_extraction.merge(_finite(predicted)[None], count, partial(context.progress, stage))
 
 
 def predictions(network: nn.Module, cloud: Tensor, batch_size: int | None = None) -> Work:

@@ -5,12 +5,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnu.upsamplers.apss import APSS
 from pnu.upsamplers.context import Context, Upsampler
-from pnu.upsamplers.midpoint import Midpoint
+from pnu.upsamplers.midpoints import Midpoint
 from pnu.upsamplers.patches import Patches
-from pnu.upsamplers.poisson import PoissonSurface
-from pnu.upsamplers.surface import SurfaceProjection
+from pnu.upsamplers.point_set_surface import APSS
+from pnu.upsamplers.poisson_samples import PoissonSurface
+from pnu.upsamplers.surface_projection import SurfaceProjection
 
 CLASSICAL: dict[str, type[Upsampler]] = {"apss": APSS, "poisson": PoissonSurface, "midpoint": Midpoint}
 """Upsamplers without training, by name."""

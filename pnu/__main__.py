@@ -1,0 +1,52 @@
+"""The command line: `pnu VERB key=value ...`, or `python -m pnu VERB ...`; each verb is a file of `commands/`."""
+
+import ast
+import difflib
+import runpy
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from pnu import __version__
+
+COMMANDS = Path(__file__).parent / "commands"
+
+
+def verbs() -> dict[str, str]:
+    """What each verb does, in a line: the first of its file's docstring, read without importing it."""
+    found = {}
+    for path in sorted(COMMANDS.glob("[a-z]*.py")):
+        text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+        found[path.stem] = text.partition("\n")[0].partition(": `")[0].rstrip(".")
+    return found
+
+
+def overview() -> str:
+    """All verbs, each with its line."""
+    known = verbs()
+    width = max(map(len, known))
+    lines = [f"  {verb:<{width}}  {line}" for verb, line in known.items()]
+    return "\n".join(
+        ["usage: pnu VERB [key=value ...]", "", *lines, "", "pnu VERB --help explains its keys; pnu --version"]
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the verb that argv names, as `python -m pnu.commands.VERB` would, so that processes which start the program
+    again (DDP, spawned workers) find it."""
+    verb, *rest = [*(sys.argv[1:] if argv is None else argv)] or ["--help"]
+    if verb in ("-h", "--help", "help"):
+        print(overview())
+    elif verb == "--version":
+        print(f"pnu {__version__}")
+    elif verb in verbs():
+        sys.argv = [sys.argv[0], *rest]
+        runpy.run_module(f"pnu.commands.{verb}", run_name="__main__", alter_sys=True)
+    else:
+        near = difflib.get_close_matches(verb, verbs(), 1, 0)[0]
+        print(f"error: unknown verb '{verb}': did you mean '{near}'? `pnu` lists them", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

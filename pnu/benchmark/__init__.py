@@ -1,0 +1,29 @@
+"""Whole clouds measured against true surfaces: inputs of several kinds, any upsamplers, tables."""
+
+from pnu.benchmark.case_sources import PARTS, Source, source
+from pnu.benchmark.cases import KINDS, Case, Truth, mesh_cases, pair_cases, truth_of_mesh
+from pnu.benchmark.measuring import Method, Row, evaluate, measure, network_upsampler
+from pnu.benchmark.result_tables import columns, legend, print_tables, result_folder, summarize, write_results
+
+__all__ = [
+    "KINDS",
+    "PARTS",
+    "Case",
+    "Method",
+    "Row",
+    "Source",
+    "Truth",
+    "columns",
+    "evaluate",
+    "legend",
+    "measure",
+    "mesh_cases",
+    "network_upsampler",
+    "pair_cases",
+    "print_tables",
+    "result_folder",
+    "source",
+    "summarize",
+    "truth_of_mesh",
+    "write_results",
+]

@@ -1,0 +1,90 @@
+"""From the config group `data` of training to the cases of an evaluation."""
+
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pnu.benchmark.cases import KINDS, Case, Warn, is_pairs_folder, mesh_cases, pair_cases, pair_files
+from pnu.data import shapes
+from pnu.data.patch_dataset import split
+from pnu.io import Mesh, meshes_of, read_mesh
+
+PARTS = ("train", "val", "test", "all")
+
+
+class Source(NamedTuple):
+    """Where cases come from."""
+
+    name: str
+    shapes: list[str]
+    kinds: list[str]
+    cases: Iterator[Case]
+
+
+def source(
+    data: Mapping[str, Any],
+    kinds: Sequence[str] = KINDS,
+    *,
+    part: str | None = None,
+    only: Sequence[str] | None = None,
+    points: int = 5000,
+    truth_points: int = 20000,
+    seed: int = 0,
+    normals: bool = True,
+    warn: Warn = print,
+) -> Source:
+    """Cases of `data`, drawn as they are asked for; what is wrong with the arguments is said at once.
+
+    Args:
+        data: a choice of conf/data: with `root` a folder of meshes, or of prepared pairs in clouds/ and truth/ (whose
+            clouds are the inputs, whatever `kinds`); with `kinds` the procedural shapes.
+        kinds: of input, some of `KINDS`.
+        part: of the shapes, split as training splits them: train, val, test or all; default: test of the procedural
+            shapes, all of a folder.
+        only: names of shapes to take; default: all of the part.
+        points: of an input cloud; a quarter of them where it is sparse.
+        truth_points: evenly spread on the true surface, to compare with.
+        seed: of all that is drawn.
+        normals: whether inputs have normals.
+    """
+    if unknown := [kind for kind in kinds if kind not in KINDS]:
+        raise ValueError(f"kinds={unknown[0]}: expected some of {', '.join(KINDS)}")
+    if part not in (None, *PARTS):
+        raise ValueError(f"part={part}: expected one of {', '.join(PARTS)}")
+    for name, value, least in (("points", points, 64), ("truth_points", truth_points, 150)):
+        if value < least:
+            raise ValueError(f"{name}={value}: expected at least {least}")
+    options: dict[str, Any] = {"truth_points": truth_points, "seed": seed, "normals": normals, "warn": warn}
+    if data.get("root") and is_pairs_folder(data["root"]):
+        root = Path(data["root"])
+        names = chosen([path.stem for path in pair_files(root)], data, part or "all", only)
+        return Source(root.resolve().name, names, ["given"], pair_cases(root, names, **options))
+    makers: dict[str, Callable[[], Mesh]]
+    if data.get("root"):
+        name, part = Path(data["root"]).resolve().name, part or "all"
+        makers = {name: functools.partial(read_mesh, path) for name, path in meshes_of(data["root"]).items()}
+    elif data.get("kinds"):
+        name, part = "synthetic", part or "test"
+        makers = {name: functools.partial(shapes.make, name) for name in shapes.names(*data["kinds"])}
+    else:
+        raise ValueError(
+            "data: evaluation takes whole shapes: data=synthetic, or data=meshes data.root=FOLDER, a folder of meshes "
+            "or one with clouds/ and truth/"
+        )
+    names = chosen(list(makers), data, part, only)
+    makers = {shape: makers[shape] for shape in names}
+    return Source(name, names, list(kinds), mesh_cases(makers, kinds, points=points, **options))
+
+
+def chosen(names: list[str], data: Mapping[str, Any], part: str, only: Sequence[str] | None) -> list[str]:
+    """The names of a part, or of `only`."""
+    if only:
+        if missing := [name for name in only if name not in names]:
+            raise ValueError(f"shapes={missing[0]}: expected some of {', '.join(names)}")
+        return list(only)
+    if part == "all":
+        return names
+    shares = {"val": float(data.get("val_share", 0.1)), "test": float(data.get("test_share", 0.1))}
+    names = sorted(names)
+    return [names[row] for row in split(names, len(names), **shares, seed=0)[part]]

@@ -1,0 +1,137 @@
+"""Tables of an evaluation: terminal, JSON, CSV."""
+
+import csv
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pnu.benchmark.measuring import Row
+from pnu.io import atomic_path, check_writable, write_json
+from pnu.metrics import METRICS, Metric, Shown
+
+COSTS = (
+    Shown("seconds", "seconds", "s", unit="seconds", form=".2f"),
+    Shown("peak_memory_mb", "memory (MiB)", "MiB", unit="MiB", form=".0f"),
+)
+LEGEND = (
+    "CD: mean squared distances, both directions added; HD: largest squared distance; P2F: mean distance to the true "
+    "mesh; all three x 1e3, in the {frame}. Normals: mean angle in degrees, signed (0..180) and unsigned (0..90); "
+    "flipped: % of them. spacing: std/mean of the nearest distance; uniform.: spread of the density over disks of 1 % "
+    "of the surface. floor: another Poisson-disk sampling of the true surface, as dense as the output."
+)
+REFERENCES = ("floor", "input")
+
+
+def legend(rows: Iterable[Row]) -> str:
+    """What the numbers mean, their units and frame."""
+    frames = dict.fromkeys(row["frame"] for row in rows)
+    return LEGEND.format(frame=f"frame of the truth ({', or '.join(frames)})")
+
+
+def columns(rows: Iterable[Row], metrics: Sequence[Metric] = METRICS) -> list[Shown]:
+    """What the rows have to be shown, in the order of the tables."""
+    found = {name for row in rows for name in row}
+    return [shown for shown in (*(metric.shown for metric in metrics), *COSTS) if shown.name in found]
+
+
+def summarize(rows: Iterable[Row], metrics: Sequence[Metric] = METRICS) -> list[Row]:
+    """Mean and spread (standard deviation) over shapes for each kind and method: keys `<metric>` and `<metric>_std`.
+
+    A metric that some shape lacks is NaN, never the mean of the others.
+    """
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["kind"], row["method"]), []).append(row)
+    result = []
+    for (kind, method), members in groups.items():
+        summary: Row = {"kind": kind, "method": method, "shapes": len(members)}
+        for name in (shown.name for shown in columns(members, metrics)):
+            values = np.array([row.get(name, math.nan) for row in members])
+            summary[name] = float(values.mean())
+            summary[f"{name}_std"] = float(values.std(ddof=1)) if len(values) > 1 else math.nan
+        result.append(summary)
+    return result
+
+
+def print_tables(rows: Sequence[Row], head: str, metrics: Sequence[Metric] = METRICS) -> None:
+    """A table for each kind of input: every shape, then mean and spread, then the references' means."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(width=max(Console().width, 118), highlight=False)
+    summaries = summarize(rows, metrics)
+    all_shown = columns(rows, metrics)
+    for kind in dict.fromkeys(row["kind"] for row in rows):
+        of_kind = [row for row in rows if row["kind"] == kind]
+        table = Table(title=f"{kind}: {counts(of_kind)}", title_justify="left", title_style="bold")
+        table.add_column("method")
+        table.add_column("shape")
+        for shown in all_shown:
+            table.add_column(shown.head or shown.title, justify="right")
+        for summary in sorted((s for s in summaries if s["kind"] == kind), key=lambda s: s["method"] in REFERENCES):
+            method = summary["method"]
+            if method not in REFERENCES:
+                for row in of_kind:
+                    if row["method"] == method:
+                        table.add_row(method, row["shape"], *(cell(row, shown) for shown in all_shown))
+            table.add_row(method, "mean", *(cell(summary, shown) for shown in all_shown), style="bold")
+            spread = {shown.name: summary.get(f"{shown.name}_std") for shown in all_shown}
+            table.add_row("", "spread", *(cell(spread, shown) for shown in all_shown), style="dim", end_section=True)
+        console.print(table)
+    console.print(f"{head}. {legend(rows)}\n")
+
+
+def counts(rows: Sequence[Row]) -> str:
+    """The numbers of points of one kind of input: "5000 -> 20000 points"."""
+    made = [row for row in rows if row["method"] not in REFERENCES]
+    pairs = sorted({(row["points_in"], row["points_out"]) for row in made})
+    return ", ".join(f"{n} -> {m}" for n, m in pairs[:3]) + (" ..." if len(pairs) > 3 else "") + " points"
+
+
+def cell(row: Mapping[str, Any], shown: Shown) -> str:
+    return shown.text(row.get(shown.name))
+
+
+def write_results(
+    folder: str | Path, rows: Sequence[Row], head: Mapping[str, Any], metrics: Sequence[Metric] = METRICS
+) -> None:
+    """metrics.json (head, rows, means and spreads) and metrics.csv (rows) in a folder that is there."""
+    folder = Path(folder)
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    with atomic_path(folder / "metrics.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, names)
+        writer.writeheader()
+        writer.writerows(rows)
+    content = {**head, **counted(rows), "legend": legend(rows), "rows": list(rows), "summary": summarize(rows, metrics)}
+    write_json(folder / "metrics.json", content)
+
+
+def counted(rows: Iterable[Row]) -> dict[str, Any]:
+    """The numbers of points that were used, whatever was asked for: one, or all of them where they differ."""
+    found: dict[str, Any] = {}
+    for name, values in (
+        ("points", {row["points_in"] for row in rows if row["method"] == "input"}),
+        ("truth_points", {row["truth_points"] for row in rows if "truth_points" in row}),
+    ):
+        if values:
+            found[name] = min(values) if len(values) == 1 else sorted(values)
+    return found
+
+
+def result_folder(path: str | Path, within: str | Path | None = None) -> Path:
+    """The folder, made where it is not there yet; ValueError if files cannot be written to it, or if a link leads
+    out of the folder `within`."""
+    path = Path(path)
+    if within is not None and not path.resolve().is_relative_to(Path(within).resolve()):
+        raise ValueError(f"{path}: a link leads out of {within}, to {path.resolve()}; give output=FOLDER")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        check_writable(path / "metrics.json")
+    except OSError as error:
+        raise ValueError(
+            f"output={path}: cannot be made a folder ({error.strerror}); choose another with output=FOLDER"
+        ) from None
+    return path

@@ -1,0 +1,229 @@
+"""From a command line to a checked config: Hydra, and what it lacks.
+
+A command is a dataclass (its keys, their types, a line on each), `conf/<command>.yaml` (their values) and a function:
+
+    @dataclass
+    class Upsample:
+        '''Densify a point cloud file.'''
+
+        input: str = doc("file to read: ply, xyz, pcd, obj, off, npy, las or laz")
+        ratio: float = doc("points out for each point in")
+
+    def upsample(cfg: Upsample) -> None:
+        import torch            # heavy imports inside: `--help` and mistakes are answered before them
+        ...
+
+    main = command(upsample, Upsample)      # values in conf/upsample.yaml
+
+    if __name__ == "__main__":
+        main()
+
+with `conf/upsample.yaml`:
+
+    defaults: [command, _self_]
+
+    input: ???      # ??? = must be given
+    ratio: 4
+
+The function gets the config resolved and checked against the dataclass, as a DictConfig (`cfg.ratio`). A `ValueError`
+or `OSError` that it raises becomes one line on stderr and exit code 2; so does any key, value or choice that the
+dataclass and conf/ do not know, also in a multirun, before the function is called. `HYDRA_FULL_ERROR=1` shows
+tracebacks. A field of type `Group` is a group of conf/: its keys are the arguments of the class that `_target_` names.
+"""
+
+import functools
+import os
+import sys
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from pnu import __version__
+from pnu.config import quoting
+from pnu.config.compose import (
+    check_keys,
+    check_single,
+    checked,
+    composer,
+    config_folder,
+    fitted,
+    in_multirun,
+    one_line,
+    said,
+    spell,
+    variations,
+)
+from pnu.config.help_text import help_text
+from pnu.config.schema import check, fields
+from pnu.training import optuna_search, sweeps
+from pnu.training.run_folder import INTERRUPTED, is_main_process
+
+
+def command(function: Callable[[Any], Any], schema: type, name: str | None = None) -> Callable[..., Any]:
+    """The entry point `main(argv=None)` of a command: `function` called with the config that argv describes.
+
+    Args:
+        function: gets the checked config; its `ValueError`s and `OSError`s become one line and exit code 2.
+        schema: dataclass that documents every key of `conf/<name>.yaml`; `also` of it: other names of keys; `commas`:
+            keys whose values hold commas.
+        name: of the config file; default: the schema's name in lower case.
+    """
+    name = name or schema.__name__.lower()
+
+    @functools.wraps(function)
+    def task(cfg: Any) -> Any:
+        from hydra.core.hydra_config import HydraConfig
+
+        hydra = HydraConfig.get()
+        try:
+            cfg, left = fitted(cfg, hydra, schema, hydra.overrides.task)
+            if left and not cfg.get("quiet"):
+                print(said(left, hydra.runtime.choices), file=sys.stderr)
+            return function(check(cfg, schema))
+        except Exception as error:
+            expected = isinstance(error, ValueError | OSError)
+            if full_errors() or not (expected or in_multirun()):
+                raise
+            if in_multirun():
+                raise sweeps.failed(error) from None
+            stop(error)
+
+    def main(argv: Sequence[str] | None = None) -> None:
+        # Hydra reads options only before the first override: `a=1 -m b=2` is as good as `-m a=1 b=2`
+        given = [
+            renamed(argument, getattr(schema, "also", {}), getattr(schema, "commas", ()))
+            for argument in (sys.argv[1:] if argv is None else argv)
+        ]
+        arguments = sorted(given, key=is_override)
+        if "--version" in arguments:  # Hydra would tell its own
+            print(f"pnu {__version__}")
+            return
+        # before torch is there: on a busy machine, threads that spin while they wait make a step take seconds
+        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+        import hydra
+        from hydra._internal.utils import get_args_parser
+
+        parsed = get_args_parser().parse_args(arguments)
+        overrides = [o for o in parsed.overrides if not o.startswith("hydra.")]
+        goes_on = parsed.multirun and "trainer" in fields(schema)
+        try:
+            with composer(name, parsed.config_dir) as compose:
+                if parsed.help:
+                    spelled = spell(overrides, schema, compose)
+                    text = help_text(schema, quoting.program(name), checked(spelled, schema, compose, complete=False))
+                    print(text)
+                    return
+                if not parsed.multirun:
+                    check_single(overrides)
+                if goes_on:
+                    added = sweeps.arguments(overrides, name)
+                    arguments += added
+                    parsed.overrides += added
+                    overrides += [o for o in added if not o.startswith("hydra.")]
+                respelled = dict(zip(overrides, spell(overrides, schema, compose), strict=True))
+                overrides = list(respelled.values())
+                arguments = [respelled.get(argument, argument) for argument in arguments]
+                check_keys(next(variations(overrides)), schema, compose)  # before the config itself adds to the sweep
+                swept = sweeps.parameters(overrides, compose) if parsed.multirun else []
+                for one in variations([*swept, *overrides]):
+                    check_keys(one, schema, compose)
+                    if parsed.cfg:
+                        continue
+                    config = checked(one, schema, compose)
+                    if goes_on:
+                        sweeps.check_job(config)
+                if goes_on:
+                    hydra_config = compose([*next(variations(overrides)), *hydras_own(parsed.overrides)], True).hydra
+                    Path(hydra_config.sweep.dir).mkdir(parents=True, exist_ok=True)
+                    arguments += optuna_search.arguments(hydra_config)
+                elif not parsed.multirun and not parsed.cfg:
+                    arguments += folder_arguments(compose([*overrides, *hydras_own(parsed.overrides)], True), schema)
+        except (ValueError, OSError) as error:
+            if full_errors():
+                raise
+            stop(error)
+        start = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=name)(task)
+        with replaced_argv(arguments), quoting.typed(name, given):
+            try:
+                if not goes_on or parsed.cfg:
+                    start()
+                else:
+                    sweeps.run(start, Path(hydra_config.sweep.dir))
+            except KeyboardInterrupt:
+                print(f"stopped; start again with: {quoting.typed_line()}", file=sys.stderr)
+                sys.exit(INTERRUPTED)
+
+    main.schema = schema  # type: ignore[attr-defined]
+    main.__doc__ = schema.__doc__
+    return main
+
+
+def hydras_own(overrides: Sequence[str]) -> list[str]:
+    return [override for override in overrides if override.startswith("hydra.")]
+
+
+def folder_arguments(config: Any, schema: type) -> list[str]:
+    """Hydra's `hydra.run.dir` as our `run`, wherever it is set.
+
+    Raises:
+        ValueError: `run` names another folder, or the command makes none.
+    """
+    given, changes = config.hydra.run.dir, config.hydra.job.chdir
+    if changes and given == "." and "trainer" in fields(schema):
+        if config.run is None:
+            raise ValueError(
+                "hydra.job.chdir=true: a run folder is named when it is made; hydra.run.dir=FOLDER names it"
+            )
+        path = Path(config.run).absolute()
+        return [quoting.override("hydra.run.dir", path), quoting.override("run", path)]
+    if given == "." or not is_main_process():  # Lightning gives the other processes of a training one of their own
+        return []
+    if "trainer" not in fields(schema):
+        if changes:
+            return []
+        raise ValueError(f"hydra.run.dir={given}: this command makes no run folder; its files are named by its keys")
+    if config.run is None:
+        return [quoting.override("run", Path(given).absolute() if changes else given)]
+    if Path(config.run).absolute() != Path(given).absolute():
+        raise ValueError(f"run={config.run} and hydra.run.dir={given}: are two folders; give one of them")
+    return []
+
+
+def is_override(argument: str) -> bool:
+    return not argument.startswith("-") and ("=" in argument or argument.startswith("~"))
+
+
+def renamed(argument: str, names: Mapping[str, str], commas: Sequence[str] = ()) -> str:
+    """An argument as Hydra shall see it: the key by its first name, and ~/ expanded, which shells leave after `=`.
+
+    commas: keys whose values hold commas, which would be several values to Hydra.
+    """
+    key, equals, value = argument.partition("=")
+    if key in commas and "," in value and not value.startswith(('"', "'")):
+        value = f'"{value.strip("[] ")}"'
+    if value.startswith("~/"):
+        value = str(Path(value).expanduser())
+    return f"{names.get(key, key)}{equals}{value}"
+
+
+def stop(error: Exception) -> typing.NoReturn:
+    if isinstance(error, BrokenPipeError):  # the reader of the output has gone, as in `... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    print(f"error: {one_line(error)}", file=sys.stderr)
+    sys.exit(2)
+
+
+def full_errors() -> bool:
+    return os.environ.get("HYDRA_FULL_ERROR") == "1"
+
+
+@contextmanager
+def replaced_argv(arguments: list[str]) -> Iterator[None]:
+    before, sys.argv = sys.argv, [sys.argv[0], *arguments]
+    try:
+        yield
+    finally:
+        sys.argv = before

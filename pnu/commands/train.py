@@ -1,0 +1,103 @@
+"""Train an upsampling network: `python -m pnu.train [key=value ...]`; `--help` lists the keys."""
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+from pnu.commands._entry import command
+from pnu.config.instantiate import PACKAGES, build, find_metric
+from pnu.config.schema import Group, Groups, doc
+from pnu.runtime.provenance import machine
+from pnu.training.result_table import closing, job_line, objective
+from pnu.training.resuming import open_run
+from pnu.training.run_folder import is_main_process
+
+
+@dataclass
+class Train:
+    """Train an upsampling network. Ends with its test metrics and a run folder for `pnu upsample`."""
+
+    seed: int = doc("of the weights, the order of the data and their augmentation")
+    name: str = doc("last part of the run folder's name")
+    run: str | None = doc("run folder; null: outputs/<date>/<time>_<name>")
+    resume: bool = doc("go on with the run in run=FOLDER, with its config, from its last checkpoint")
+    weights: str | None = doc("to start from: run folder, or weights that come with pnu; null: drawn by the seed")
+    threads: int | None = doc("threads of a training on the CPU; null: one for each core; small patches want one")
+    quiet: bool = doc("print the run folder alone")
+    sweep: str | None = doc("name of a sweep (-m) below outputs/sweeps; null: made of the command line")
+    metrics: list[str] = doc("classes of metrics of your own, measured beside pnu's: [mylab.Roughness]")
+    objective: list[str] | None = doc("validation metrics that a search (hparams_search) makes small")
+    allow: list[str] = doc("packages of your own whose classes a config may name, as loss._target_=mylab.Laplacian")
+    data: Group = doc("Data")
+    model: Group = doc("Network")
+    loss: Group = doc("Loss")
+    optimizer: Group = doc("Optimizer")
+    scheduler: Group = doc("Learning rate, stepped after each training step")
+    trainer: Group = doc("Training, by Lightning's Trainer")
+    callbacks: Groups = doc("Beside the training")
+    logger: Groups = doc("Where curves go")
+
+
+def train(cfg: Any) -> list[float] | None:
+    """Train as the config says; the best validation's values of what the config names as objective."""
+    run, config = open_run(cfg, Train)
+    if run.skip:
+        run.unlock()
+        print(f"{run}: {run.skip}")
+        return objective(config, run)
+    with run.recorded(config) as record:
+        import lightning.pytorch as pl  # seconds: only once the config is known to be good
+        import torch
+
+        from pnu import metrics, networks
+        from pnu.networks import checkpoints
+        from pnu.training import callbacks, lightning_module
+
+        lightning_module.quieten()
+        lightning_module.keep_threads()
+        if config["threads"]:
+            torch.set_num_threads(config["threads"])
+        pl.seed_everything(config["seed"], verbose=False)
+        allow = config["allow"]
+        parts = {
+            group: build(config[group], PACKAGES[group], allow=allow)
+            for group in ("data", "loss", "optimizer", "scheduler")
+        }
+        model, data = networks.build(config["model"], allow), parts.pop("data")
+        if source := config.get("weights"):
+            checkpoints.fill(model, checkpoints.load(source, allow).state_dict(), source)
+        find = functools.partial(find_metric, allow=allow)
+        chosen = metrics.with_own(config.get("metrics") or (), find)
+        record["metrics"] = {m.shown.name: m.shown._asdict() for m in chosen if m not in metrics.METRICS}
+        module = lightning_module.UpsamplingModule(model, **parts, metrics=chosen)
+        options: Any = {
+            name: value for name, value in lightning_module.TRAINER_OPTIONS.items() if name not in config["trainer"]
+        }
+        with lightning_module.misconfigured():
+            trainer = build(
+                config["trainer"],
+                PACKAGES["trainer"],
+                callbacks=callbacks.build_all(config, run),
+                logger=callbacks.build_loggers(config, run) or False,
+                plugins=[callbacks.AtomicCheckpointIO(), *lightning_module.norm_plugins(config["trainer"])],
+                default_root_dir=run.path,
+                **options,
+            )
+        record |= {"device": str(trainer.strategy.root_device), "machine": machine()}
+        start = run.last if run.last.exists() else None
+        if start is None:
+            run.add_metrics("start" if source else "untrained", trainer.validate(module, data, verbose=False))
+        trainer.fit(module, data, ckpt_path=start, weights_only=True)
+        if run.best.exists():
+            module.load_state_dict(checkpoints.read(run.best)["state_dict"])
+        run.add_metrics("test", trainer.test(module, data, verbose=False))
+        result = objective(config, run)
+    if is_main_process():
+        print(run if config["quiet"] else job_line(run) if "job" in run.facts else closing(run))
+    return result
+
+
+main = command(train, Train)
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,138 @@
+"""Densify a point cloud file: `pnu upsample input=cloud.ply output=dense.ply`."""
+
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from pnu.commands._entry import command
+from pnu.config.quoting import shell_line
+from pnu.config.schema import doc
+from pnu.runtime.progress import stages
+
+if TYPE_CHECKING:
+    from pnu.io import Cloud
+
+LONG = 500_000  # points made, from which on finished parts are kept beside the output until it is there
+
+
+@dataclass
+class Upsample:
+    """Densify a point cloud file with a trained network; `model=NAME` is `run=NAME`."""
+
+    also: ClassVar = {"model": "run"}
+    commas: ClassVar = ("columns",)
+    input: str = doc(
+        "file to read: ply, text (xyz, csv, pts ...), pcd, las, laz, e57, npy, npz; of a mesh its vertices"
+    )
+    output: str = doc("file to write; its suffix says the format")
+    run: str = doc("run folder, or weights that come with pnu: surface, pnu ...; newest: the run that finished last")
+    ratio: float = doc("points out for each point in, any number >= 1")
+    normals: str = doc("auto: the file's, estimated where it has none; estimate: always estimated")
+    columns: str | None = doc(
+        "of text, or an array without names: x,y,z,_,r,g,b (_ is left out); null: by its names or the usual order"
+    )
+    sample: int | None = doc("of a mesh: as many points on its faces, with their normals; null: its vertices")
+    patch_size: int | None = doc("points of a patch, at least 16; null: what the network was made for")
+    batch_size: int | None = doc("patches (surface: points) at once, bounds the memory; null: by the device")
+    device: str = doc("auto, cpu, cuda, cuda:1 ...")
+    devices: int = doc("CUDA devices, or processes on the CPU, that share the work; the result stays the same")
+    seed: int = doc("of models that draw random numbers")
+    allow: list[str] = doc("packages of your own whose networks a run may name; they run their code")
+    quiet: bool = doc("print nothing but errors")
+
+
+def upsample(cfg: Any) -> None:
+    from pnu import io
+
+    started = time.perf_counter()
+    say: Callable[[str], None] = (lambda text: None) if cfg.quiet else print
+    if cfg.normals not in ("auto", "estimate"):
+        raise ValueError(f"normals={cfg.normals}: expected auto or estimate")
+    if not 1 <= cfg.ratio < float("inf"):  # here too: the network's libraries take seconds to load
+        raise ValueError(f"ratio={cfg.ratio:g}: expected a number >= 1, the points out for each point in")
+    io.check_output(cfg.output)
+    if Path(cfg.output).resolve() == Path(cfg.input).resolve():
+        raise ValueError(f"output={cfg.output}: is the input; give another name")
+    if cfg.sample is None:
+        cloud = io.read_cloud(cfg.input, normals=cfg.normals == "auto", columns=cfg.columns)
+    else:
+        cloud = sampled(cfg.input, cfg.sample, cfg.normals == "auto", cfg.seed)
+    origin = "with normals" if cloud.normals is not None else "normals estimated and oriented"
+    say(f"input:  {cfg.input}, {len(cloud.points)} points, {origin}")
+    for note in cloud.notes:
+        say(f"        {note}")
+
+    from pnu import weights
+    from pnu.geometry.cloud_statistics import survey
+    from pnu.networks import checkpoints
+    from pnu.networks.checkpoints import NEWEST
+    from pnu.upsamplers import whole_clouds
+
+    look = survey(cloud.points, cloud.normals)
+    say(f"        {look}")
+    for text in look.warnings():
+        say(f"        {text}")
+    run = whole_clouds.source(cfg.run, cloud.normals)
+    chosen = (
+        " (the newest finished one)" if cfg.run == NEWEST else " (comes with pnu)" if run in weights.names() else ""
+    )
+    say(f"run:    {run}{chosen}")
+    # a long one goes on, after an interruption, from the parts that are done
+    parts = Path(f"{cfg.output}.parts") if cfg.ratio * len(cloud.points) >= LONG else None
+    if parts is not None and parts.is_dir():
+        say(f"parts:  {parts}, of an earlier start; what fits is taken")
+    with stages(cfg.quiet) as progress:
+        dense = whole_clouds.upsample(
+            cloud.points,
+            cloud.normals,
+            ratio=cfg.ratio,
+            model=checkpoints.load(run, cfg.allow) if cfg.allow else run,
+            patch_size=cfg.patch_size,
+            device=cfg.device,
+            devices=cfg.devices,
+            batch_size=cfg.batch_size,
+            seed=cfg.seed,
+            progress=progress,
+            parts=parts,
+        )
+    kept = io.kept_attributes(cfg.output, cloud.attributes)
+    held = cloud._replace(attributes={name: cloud.attributes[name] for name in kept})
+    notes = io.write_cloud(cfg.output, dense[:, :3], dense[:, 3:], whole_clouds.attributes(dense, held))
+    if parts is not None:
+        shutil.rmtree(parts, ignore_errors=True)
+    for told, names in (("carried over", kept), ("left out", [name for name in cloud.attributes if name not in kept])):
+        if names:
+            say(f"        {told}: {', '.join(names)}")
+    for note in notes:
+        say(f"        {note}")
+    say(f"output: {cfg.output}, {len(dense)} points with unit normals, {time.perf_counter() - started:.1f} s")
+    say(f"next:   {shell_line('reconstruct', input=cfg.output, output='mesh.ply')}")
+
+
+def sampled(path: str, count: int, normals: bool, seed: int) -> "Cloud":
+    """So many points spread evenly over the faces of a mesh, with their normals."""
+    import numpy as np
+
+    from pnu import io
+    from pnu.geometry.mesh_sampling import sample_poisson_disk
+
+    if count < 16:
+        raise ValueError(f"sample={count}: expected at least 16 points, such as 5000")
+    if Path(path).suffix.lower() not in io.MESH_SUFFIXES:
+        raise ValueError(f"sample={count}: {path} is no mesh; leave sample=null")
+    mesh = io.read_mesh(path)
+    try:
+        points = sample_poisson_disk(mesh, count, np.random.default_rng(seed))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    note = f"a mesh: the points are on its {len(mesh.faces)} faces, not its {len(mesh.vertices)} vertices"
+    return io.Cloud(points[:, :3], points[:, 3:] if normals else None, {}, (note,))
+
+
+main = command(upsample, Upsample)
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,73 @@
+"""Data module of the surface model: crops for training, whole clouds of other shapes for validation and test."""
+
+from collections.abc import Iterable
+from typing import Any, Literal
+
+from pnu.data import shapes
+from pnu.data.crops import SMALLEST, Crops, WholeClouds, flattened, stacked
+from pnu.data.mesh_scene import Truth
+from pnu.data.patch_module import EpochDataModule, say_open
+from pnu.geometry.mesh_topology import open_edges
+from pnu.io import meshes_of, read_mesh
+
+
+class ProjectionDataModule(EpochDataModule):
+    """Crops of clouds drawn from meshes.
+
+    Args:
+        root: folder of closed meshes, beside the procedural shapes; null: those alone
+        procedural: train on the procedural shapes
+        validation: names of the meshes kept for validation and test
+        normals: of the input: given, or estimated from its points
+        clouds: of an epoch, each drawn anew
+        size: points of a crop
+        views: crops of a cloud
+        batch_size: clouds of a batch, on each device
+        points: points of a validation cloud
+        workers: processes that draw crops; 0: the training's own
+        seed: of all draws
+    """
+
+    kind = "clouds"
+    collate, collate_evaluation = staticmethod(flattened), staticmethod(stacked)
+
+    def __init__(
+        self, root: str | None = None, procedural: bool = True, validation: Iterable[str] = (),
+        normals: Literal["given", "estimated"] = "given", clouds: int = 6400, size: int = 384, views: int = 2,
+        batch_size: int = 8, points: int = 2048, workers: int = 0, seed: int = 0,
+    ) -> None:  # fmt: skip
+        super().__init__(batch_size, workers, seed)
+        if points < SMALLEST:
+            raise ValueError(f"data.points={points}: expected at least {SMALLEST}")
+        self.evaluation_batch_size = 1
+        self.root, self.procedural, self.held_out = root, procedural, list(validation)
+        self.normals, self.clouds, self.size, self.views, self.points = normals, clouds, size, views, points
+        self.truth: Truth | None = None
+
+    def setup(self, stage: str | None = None) -> None:
+        if self.truth is not None:
+            return
+        files = meshes_of(self.root) if self.root else {}
+        meshes = {name: shapes.unit(read_mesh(path)) for name, path in files.items()}
+        if self.process[0] == 0:
+            say_open({name: open_edges(mesh) for name, mesh in meshes.items()})
+        if self.procedural:
+            meshes |= {name: shapes.make(name) for name in shapes.names()}
+        missing = [name for name in self.held_out if name not in meshes]
+        if missing:
+            raise ValueError(f"data.validation: found no mesh {missing[0]} in data.root={self.root}")
+        held_out = {name: meshes.pop(name) for name in self.held_out}
+        if not meshes:
+            raise ValueError(f"data.root={self.root}: expected meshes to train on, found none but those of validation")
+        self.truth = Truth(list(meshes.values()))
+        self.check_batch_size(self.clouds, f"data.clouds={self.clouds}")
+        train = Crops(meshes, self.clouds, size=self.size, views=self.views, normals=self.normals, seed=self.seed)
+        clouds = {
+            part: WholeClouds(held_out, self.points, normals=self.normals, seed=seed)
+            for part, seed in (("val", 1), ("test", 2))
+        }
+        self.datasets = {"train": train, **clouds}
+
+    def on_after_batch_transfer(self, batch: dict[str, Any], dataloader_idx: int) -> dict[str, Any]:
+        """Adds what the loss asks for the closest surface points; here, so that no worker process has to send it."""
+        return {**batch, "surface": self.truth} if "center" in batch else batch

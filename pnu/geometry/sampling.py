@@ -1,0 +1,199 @@
+"""Choose some points of a cloud: evenly, at random, or unevenly on purpose."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pnu.geometry.farthest_blocks import farthest_in_blocks
+from pnu.geometry.neighbor_search import gpu_kernels, nearest, per_cloud
+from pnu.runtime.progress import Step, silent
+
+try:
+    import fpsample
+except ImportError:  # Python 3.13, for which it has no wheel: plain steps, smaller blocks
+    fpsample = None
+
+NEAR_ORIGIN_SQ = 1e-3  # the released code's threshold on |x|^2
+BUCKETS_PAY = 2**16  # from this many distances on
+LARGE = 2**18 if fpsample else 2**14  # points; more are sampled in blocks
+LARGE_BLOCK = None if fpsample else 2**12  # of so many points, None the default,
+LARGE_SHARE = 64 if fpsample else 4  # unless so few are wanted that blocks would hold too few of them
+
+
+def farthest_points(points: Tensor, m: int, *, start: int | Tensor = 0, skip_near_origin: bool = False) -> Tensor:
+    """Greedy farthest point sampling: from `start` on, always the point farthest from all chosen before.
+
+    points (B, n, 3), start one index or (B,) -> idx (B, m) int64 in the order of choice, all different; computed in
+    float32, equal distances in any order. With `skip_near_origin` (released code) points with |x|^2 <= 1e-3 are chosen
+    as the start only, and when the others run out the first of them is repeated. ValueError if m is not in 1..n.
+    """
+    clouds, n, _ = points.shape
+    _check_count(m, n)
+    first = torch.as_tensor(start).cpu().expand(clouds)
+    if bool(((first < 0) | (first >= n)).any()):
+        raise ValueError(f"start: expected indices in 0..{n - 1}, found {start}")
+    xyz = _float32(points.detach())
+    if points.device.type != "cpu":
+        first = first.to(points.device)
+        kernels = gpu_kernels(xyz)
+        if kernels and n <= kernels.FARTHEST_LIMIT:
+            return kernels.farthest_points(xyz, m, first, NEAR_ORIGIN_SQ if skip_near_origin else -1.0)
+        return _farthest_steps(xyz, m, first, skip_near_origin)
+    arrays, starts, out = xyz.numpy(), first.tolist(), np.empty((clouds, m), np.int64)
+
+    def sample(b: int) -> None:
+        choose = _farthest_off_origin if skip_near_origin else _farthest
+        out[b] = choose(arrays[b], m, starts[b])
+
+    per_cloud(sample, clouds)
+    return torch.from_numpy(out)
+
+
+def farthest_points_large(points: np.ndarray | Tensor, m: int, *, step: Step = silent) -> np.ndarray:
+    """`farthest_points` from point 0 of one whole cloud (n, 3), in NumPy: idx (m,) int64, exactly m, all different.
+
+    Beyond LARGE points it works block by block (`farthest_blocks`), as evenly but from another point on, in time
+    linear in n. ValueError if m is not in 1..n.
+    """
+    xyz = points.detach().cpu() if isinstance(points, Tensor) else torch.from_numpy(np.ascontiguousarray(points))
+    _check_count(m, len(xyz))
+    array = _float32(xyz[None])[0].numpy()
+    if len(array) <= LARGE or m < len(array) // LARGE_SHARE:
+        step(0, 1)
+        chosen = _farthest(array, m, 0)
+        step(1, 1)
+        return chosen
+    return farthest_in_blocks(
+        array,
+        m,
+        lambda part, number: _farthest(part, number, 0),
+        threads=torch.get_num_threads(),
+        size=LARGE_BLOCK,
+        step=step,
+    )
+
+
+def random_points(points: Tensor, m: int, *, generator: torch.Generator) -> Tensor:
+    """Uniform draw without replacement: points (B, n, 3) -> idx (B, m) int64. ValueError if m is not in 1..n."""
+    clouds, n, _ = points.shape
+    _check_count(m, n)
+    noise = torch.rand(clouds, n, generator=generator, device=generator.device)
+    return noise.topk(m, dim=1).indices.to(points.device)
+
+
+def nonuniform_points(points: Tensor, m: int, *, strength: float, centers: int, generator: torch.Generator) -> Tensor:
+    """Draw without replacement, dense around random centres and ever thinner away from them.
+
+    points (B, n, 3) -> idx (B, m) int64 in the order of the draws. `centers` of a cloud's own points are chosen at
+    random; a point's weight is exp(-strength d), where d is the distance to the nearest of them as a fraction of the
+    greatest such distance: `strength` is the logarithm of how much denser the centres are, 0 a uniform draw.
+    Successive weighted draws are the m largest of log weight + Gumbel noise (Efraimidis and Spirakis 2006).
+    ValueError if m or centers is not in 1..n, or strength is negative.
+    """
+    clouds, n, _ = points.shape
+    _check_count(m, n)
+    if not strength >= 0:
+        raise ValueError(f"strength: expected a number >= 0, found {strength}")
+    if not 1 <= centers <= n:
+        raise ValueError(f"centers: expected 1 to {n} centres, found {centers}")
+    chosen = random_points(points, centers, generator=generator)
+    distance = nearest(points, points.gather(1, chosen[..., None].expand(-1, -1, 3))).dist_sq.sqrt()
+    fraction = distance / distance.amax(1, keepdim=True).clamp_min(torch.finfo(distance.dtype).tiny)
+    noise = torch.empty(clouds, n, device=generator.device).exponential_(generator=generator)
+    return (-strength * fraction - noise.to(points.device).log()).topk(m, dim=1).indices
+
+
+def poisson_disk_points(points: Tensor, m: int, *, generator: torch.Generator) -> Tensor:
+    """Evenly spread subset, exactly m: `farthest_points` from a random start. points (B, n, 3) -> idx (B, m) int64."""
+    start = torch.randint(points.shape[1], (len(points),), generator=generator, device=generator.device)
+    return farthest_points(points, m, start=start)
+
+
+def _check_count(m: int, n: int) -> None:
+    if not 1 <= m <= n:
+        raise ValueError(f"m: expected 1 to {n} points (the size of the cloud), found {m}")
+
+
+def _float32(points: Tensor) -> Tensor:
+    if points.dtype == torch.float64:  # map coordinates, say, lose their detail in float32
+        points = points - points.mean(1, keepdim=True)
+    return points.float().contiguous()
+
+
+def _farthest(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
+    chosen = _greedy(xyz, m, start)
+    different = np.unique(chosen, return_index=True)[1]
+    if len(different) == m:
+        return chosen
+    # the cloud has duplicates: once all places are taken the sampler repeats itself
+    kept = chosen[np.sort(different)]
+    rest = np.setdiff1d(np.arange(len(xyz)), kept)
+    return np.concatenate([kept, rest[: m - len(kept)]])
+
+
+def _farthest_off_origin(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
+    allowed = (xyz**2).sum(1) > NEAR_ORIGIN_SQ
+    refill = int(allowed.argmax())
+    allowed[start] = True
+    index = np.flatnonzero(allowed)
+    chosen = index[_farthest(xyz[index], min(m, len(index)), int(np.searchsorted(index, start)))]
+    return np.concatenate([chosen, np.full(m - len(chosen), refill)])
+
+
+def _greedy(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
+    """Bucket sampler (QuickFPS) where it pays; it counts its start in its own tree's order."""
+    n = len(xyz)
+    if fpsample is None:
+        return _greedy_steps(xyz, m, start)
+    if n >= 16 and m * n > BUCKETS_PAY:
+        height = max(3, round(np.log2(n) / 2 - 1))
+        chosen = fpsample.bucket_fps_kdline_sampling(xyz, m, height, _tree_slot(xyz, height, start))
+        if chosen[0] == start:
+            return chosen.astype(np.int64)
+    return fpsample.fps_sampling(xyz, m, start).astype(np.int64)
+
+
+def _greedy_steps(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
+    axes, step = np.ascontiguousarray(xyz.T), np.empty_like(xyz.T, order="C")
+    dist_sq, chosen = np.full(len(xyz), np.inf, np.float32), np.empty(m, np.int64)
+    for i in range(m):
+        chosen[i] = start
+        np.subtract(axes, axes[:, start, None], out=step)
+        np.multiply(step, step, out=step)
+        np.minimum(dist_sq, step.sum(0), out=dist_sq)
+        start = int(dist_sq.argmax())
+    return chosen
+
+
+def _tree_slot(xyz: np.ndarray, height: int, start: int) -> int:
+    """Where fpsample's tree puts a point: nodes are cut at the mean of their widest axis by swaps from both ends."""
+    order, offset = np.arange(len(xyz)), 0
+    for _ in range(height):
+        node = xyz[order]
+        value = node[:, np.ptp(node, axis=0).argmax()]
+        low = value < np.cumsum(value, dtype=np.float32)[-1] / np.float32(len(value))
+        cut = int(low.sum())
+        high_left, low_right = np.flatnonzero(~low[:cut]), cut + np.flatnonzero(low[cut:])[::-1]
+        order[high_left], order[low_right] = order[low_right], order[high_left]
+        if np.flatnonzero(order == start)[0] < cut:
+            order = order[:cut]
+        else:
+            order, offset = order[cut:], offset + cut
+    return offset + int(np.flatnonzero(order == start)[0])
+
+
+def _farthest_steps(points: Tensor, m: int, start: Tensor, skip_near_origin: bool) -> Tensor:
+    clouds, n, _ = points.shape
+    row = torch.arange(clouds, device=points.device)
+    dist_sq = points.new_full((clouds, n), torch.inf)
+    eligible = points.square().sum(-1) > (NEAR_ORIGIN_SQ if skip_near_origin else -1)
+    dist_sq[~eligible] = -2
+    current = start
+    out = torch.empty(clouds, m, dtype=torch.int64, device=points.device)
+    for i in range(m):
+        out[:, i] = current
+        step = (points - points[row, current][:, None]).square_().sum(-1)
+        torch.minimum(dist_sq, step, out=dist_sq)
+        dist_sq[row, current] = torch.where(eligible[row, current], -1.0, -2.0)
+        current = dist_sq.argmax(1)
+    return out

@@ -1,0 +1,15 @@
+"""Surfaces from points with normals, and how far they lie from the true ones."""
+
+from pnu.reconstruction.screened_poisson import Surface, interpolate, octree_depth, reconstruct, trim
+from pnu.reconstruction.surface_errors import SurfaceErrors, check_frame, surface_errors
+
+__all__ = [
+    "Surface",
+    "SurfaceErrors",
+    "check_frame",
+    "interpolate",
+    "octree_depth",
+    "reconstruct",
+    "surface_errors",
+    "trim",
+]

@@ -1,0 +1,1 @@
+"""Plots, pages with tables and 3D views, and reports of sweeps and comparisons."""

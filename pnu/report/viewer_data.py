@@ -1,0 +1,93 @@
+"""Clouds and surfaces in a page: few bytes a point, packed, for the viewer (viewer.js) to unpack."""
+
+import base64
+import gzip
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnu.geometry.mesh_topology import split_creases
+from pnu.geometry.spacing import spacing
+from pnu.io import Mesh
+
+RANGE = 1.25  # of the true radius; what lies farther out is drawn there
+
+
+class Drawing(NamedTuple):
+    """One thing to show in a view: a cloud, a surface, or both."""
+
+    name: str
+    cloud: NDArray | None = None  # (n, 3) or (n, 6)
+    cloud_error: NDArray | None = None  # (n,)
+    surface: Mesh | None = None
+    surface_error: NDArray | None = None  # (v,)
+
+
+class View(NamedTuple):
+    """Drawings of one shape, to be compared: same frame, same scale of errors."""
+
+    shape: str
+    kind: str
+    drawings: Sequence[Drawing]
+    center: NDArray  # (3,) of the true shape
+    radius: float
+    limit: float  # error at the end of the colours, in the unit of the points
+
+
+class Packer:
+    """Arrays one after another, each at a multiple of four bytes."""
+
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+        self.size = 0
+
+    def add(self, values: NDArray, dtype: str) -> list[int]:
+        """Where the values lie: [first byte, number of values]."""
+        place = [self.size, values.size]
+        data = np.ascontiguousarray(values, np.dtype(dtype)).tobytes()
+        data += bytes(-len(data) % 4)
+        self.parts.append(data)
+        self.size += len(data)
+        return place
+
+    def text(self) -> str:
+        return base64.b64encode(gzip.compress(b"".join(self.parts), 6, mtime=0)).decode()
+
+
+def encode(view: View) -> dict[str, Any]:
+    """The view as JSON; positions to 1/26000 of the radius, normals to half a degree, errors to 1/255 of the limit."""
+    packer = Packer()
+    items = []
+    for drawing in view.drawings:
+        item: dict[str, Any] = {"name": drawing.name}
+        if drawing.cloud is not None:
+            points = drawing.cloud[:, :3]
+            normals = drawing.cloud[:, 3:6] if drawing.cloud.shape[1] >= 6 else None
+            item["cloud"] = vertices(packer, view, points, normals, drawing.cloud_error)
+            item["cloud"]["spacing"] = round(spacing(points) / view.radius, 6)
+        if drawing.surface is not None:
+            points, normals, faces = split_creases(drawing.surface)
+            error = drawing.surface_error
+            if error is not None:
+                copy_of = np.empty(len(points), np.int64)
+                copy_of[faces] = drawing.surface.faces
+                error = error[copy_of]
+            item["surface"] = vertices(packer, view, points, normals, error)
+            item["surface"]["index"] = packer.add(np.diff(faces.ravel(), prepend=0), "<i4")  # differences pack better
+        items.append(item)
+    limit = f"{1e3 * view.limit / view.radius:.3g}"
+    return {"shape": view.shape, "kind": view.kind, "limit": limit, "items": items, "data": packer.text()}
+
+
+def vertices(
+    packer: Packer, view: View, points: NDArray, normals: NDArray | None, error: NDArray | None
+) -> dict[str, Any]:
+    unit = (points - view.center) / (RANGE * view.radius)
+    places = {"position": packer.add(np.rint((unit.clip(-1, 1) + 1) * 32767.5), "<u2")}
+    if normals is not None:
+        places["normal"] = packer.add(np.rint(127 * normals.clip(-1, 1)), "i1")
+    if error is not None:
+        places["error"] = packer.add(np.rint(255 * (error / view.limit).clip(0, 1)), "u1")
+    return places

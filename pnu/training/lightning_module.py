@@ -1,0 +1,242 @@
+"""Training as Lightning sees it: one step, one validation, the optimizer."""
+
+import inspect
+import logging
+import math
+import os
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+from lightning.pytorch.plugins.layer_sync import TorchSyncBatchNorm
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.utilities.types import OptimizerLRScheduler
+from torch import Tensor, nn
+
+from pnu.fast import accelerate
+from pnu.metrics import METRICS, CloudMetrics, Metric
+from pnu.networks.checkpoints import write
+from pnu.networks.norm import synchronize
+from pnu.upsamplers import dense_patches
+
+Batch = Mapping[str, Any]
+
+
+# What is not for the user to choose: our own callbacks save, show progress and pictures; the data's sampler knows
+# about processes; values are logged at every step.
+TRAINER_OPTIONS = {
+    "enable_checkpointing": False,
+    "enable_progress_bar": False,
+    "enable_model_summary": False,
+    "num_sanity_val_steps": 0,
+    "log_every_n_steps": 1,
+    "inference_mode": False,  # its tensors would stay in the metrics, of no use to the training after them
+    "use_distributed_sampler": False,
+}
+NOISE = (  # warnings of Lightning and torch that ask for what is meant as it is
+    ".*does not have many workers.*",
+    ".*is smaller than the logging interval.*",
+    ".*Checkpoint directory .* exists and is not empty.*",
+    ".*Found .* module.s. in eval mode at the start of training.*",
+    ".*You're resuming from a checkpoint that ended before the epoch ended.*",
+    ".*treespec.*is deprecated.*",
+)
+
+
+def quieten() -> None:
+    """Silence Lightning's advice and start-up lines; its errors and other warnings stay."""
+    for name in ("lightning.pytorch", "lightning.fabric", "pytorch_lightning"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    for message in NOISE:
+        warnings.filterwarnings("ignore", message=message)
+
+
+def keep_threads() -> None:
+    """Let OMP_NUM_THREADS decide how many threads torch uses: joblib gives its processes an MKL_NUM_THREADS of its own,
+    which torch takes instead, and another number of threads rounds differently."""
+    if os.environ.get("OMP_NUM_THREADS", "").isdigit():
+        torch.set_num_threads(max(1, int(os.environ["OMP_NUM_THREADS"])))
+
+
+class SynchronizedNorms(TorchSyncBatchNorm):
+    """trainer.sync_batchnorm=true, on the CPU as well."""
+
+    def apply(self, model: nn.Module) -> nn.Module:
+        return synchronize(model)
+
+    def revert(self, model: nn.Module) -> nn.Module:
+        return synchronize(model, False)
+
+
+def norm_plugins(trainer: Mapping[str, Any]) -> list[SynchronizedNorms]:
+    """What Lightning needs for the trainer's sync_batchnorm."""
+    return [SynchronizedNorms()] if trainer.get("sync_batchnorm") else []
+
+
+@contextmanager
+def misconfigured() -> Iterator[None]:
+    """What Lightning says against a configuration, as a ValueError."""
+    try:
+        yield
+    except MisconfigurationException as error:
+        raise ValueError(f"trainer: {' '.join(str(error).split())}") from error
+
+
+class NonFinite(ValueError):
+    """NaN or infinity in the loss or its gradient; the message names the step and the term."""
+
+
+def joined(batches: Sequence[Batch]) -> dict[str, Any]:
+    """Several batches as one: tensors and lists; what else a batch has is left out."""
+    return {
+        name: torch.cat([batch[name] for batch in batches])
+        if isinstance(value, Tensor)
+        else [item for batch in batches for item in batch[name]]
+        for name, value in batches[0].items()
+        if isinstance(value, Tensor | list)
+    }
+
+
+def _finite(value: Tensor) -> bool:
+    return math.isfinite(float(value))
+
+
+class UpsamplingModule(pl.LightningModule):
+    """A network and its loss.
+
+    A batch has "input" (B, n, 6), "target" (B, m, 6) and whatever else the loss reads. Logged are every loss term at
+    every step (train/cd ... train/loss; means over the micro-batches of the step and over processes), the norm of the
+    gradient, the learning rate, and the metrics of `CloudMetrics` over validation (val/...) and test (test/...) clouds,
+    each in the frame of its patch.
+
+    Args:
+        model: maps patches (B, n, 6) to (B, ratio n, 6 or 3).
+        loss: called with prediction, target and extra; gives terms by name and their weighted sum as "loss".
+        optimizer: called with the parameters.
+        scheduler: called with the optimizer, stepped after each step. What it calls `total_steps` or `T_max` is the
+            number of steps of the whole training.
+        metrics: of validation and test, those that are for patches.
+    """
+
+    model: Any  # a network: an nn.Module with outputs()
+
+    def __init__(
+        self,
+        model: nn.Module,
+        loss: nn.Module | None = None,
+        optimizer: Callable[..., torch.optim.Optimizer] | None = None,
+        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+        metrics: Sequence[Metric] = METRICS,
+    ) -> None:
+        super().__init__()
+        self.model = accelerate(model)
+        self.loss = None if loss is None else accelerate(loss)
+        self.optimizer, self.scheduler = optimizer, scheduler
+        normals = bool(getattr(model, "predicts_normals", True))
+        self.val_metrics, self.test_metrics = CloudMetrics(normals, metrics), CloudMetrics(normals, metrics)
+        self.micro_batches: list[tuple[dict[str, Tensor], Batch]] = []  # of this step: values and batch
+        self.started_at, self.elapsed_s = time.monotonic(), 0.0  # elapsed_s is the same in all processes
+
+    def forward(self, patch: Tensor) -> Tensor:
+        return dense_patches(self.model, patch)
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        assert self.loss is not None
+        outputs = {name: value.float() for name, value in self.model.outputs(batch["input"]).items()}
+        found = {"prediction": outputs["prediction"].detach().abs().amax()}
+        try:
+            # searches and small differences of coordinates want float32, whatever the network computed in
+            with torch.autocast(self.device.type, enabled=False):
+                terms = self.loss(outputs["prediction"], batch["target"], {**batch, **outputs})
+        except Exception:  # a loss may break at NaN, with words about something else
+            self.micro_batches.append((found, batch))
+            self.check_finite(found)
+            raise
+        self.micro_batches.append((found | {name: value.detach() for name, value in terms.items()}, batch))
+        return terms["loss"]
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """Checks and logs the step: means over micro-batches and processes, in one transfer from the device."""
+        gradients = [p.grad for p in self.parameters() if p.grad is not None]
+        norm = torch.nn.utils.get_total_norm(gradients) if gradients else torch.zeros((), device=self.device)
+        names = list(self.micro_batches[0][0])
+        found = torch.stack([values[name].to(norm) for values, _ in self.micro_batches for name in names])
+        clock = norm.new_tensor(time.monotonic() - self.started_at)
+        means = torch.cat([found.view(-1, len(names)).mean(0), norm[None], clock[None]])
+        means = self.trainer.strategy.reduce(means, reduce_op="mean")
+        *numbers, gradient_norm, self.elapsed_s = means.tolist()
+        values = dict(zip(names, numbers, strict=True))
+        # in mixed precision the scaler expects infinite gradients and skips their step
+        self.check_finite(values if self.trainer.precision == "16-mixed" else values | {"gradient": gradient_norm})
+        self.micro_batches = []
+        del values["prediction"]
+        logged = {f"train/{name}": value for name, value in values.items()}
+        logged |= {"train/gradient_norm": gradient_norm, "train/lr": float(optimizer.param_groups[0]["lr"])}
+        # as tensors of the CPU: a number would be sent to the device, and back where it is shown
+        self.log_dict({name: torch.tensor(value) for name, value in logged.items()}, logger=False)
+        # written at once, before the checkpoint of this step: a training that is killed after it loses no step's values
+        for logger in self.loggers:
+            logger.log_metrics(logged, self.global_step)
+
+    def check_finite(self, values: Mapping[str, float | Tensor]) -> None:
+        """Stop the training at NaN or infinity and keep the micro-batches that it comes from for inspection.
+
+        Args:
+            values: of a step, means over micro-batches and processes.
+
+        Raises:
+            NonFinite: names the step, the terms and the file with the batch.
+        """
+        broken = [name for name, value in values.items() if not math.isfinite(float(value))]
+        if not broken:
+            return
+        here = [(terms, batch) for terms, batch in self.micro_batches if not all(map(_finite, terms.values()))]
+        kept = here or self.micro_batches  # of a gradient alone any of them may be the cause
+        path = Path(self.trainer.default_root_dir) / f"nonfinite_step{self.global_step}_rank{self.global_rank}.pt"
+        terms = {name: float(value) for name, value in (kept[0][0] if here else values).items()}
+        write(path, {"step": self.global_step, "terms": terms, "batch": joined([batch for _, batch in kept])})
+        first = next((name for name in broken if name != "loss"), broken[0])
+        raise NonFinite(
+            f"step {self.global_step}: {first} is {float(values[first])}; the batch is in {path};"
+            " a lower optimizer.lr or trainer.gradient_clip_val=1 often cures it"
+        )
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        self.val_metrics.update(self(batch["input"]).float(), batch["target"])
+
+    def on_validation_epoch_end(self) -> None:
+        self.log_metrics("val", self.val_metrics)
+
+    def test_step(self, batch: Batch, batch_idx: int) -> None:
+        self.test_metrics.update(self(batch["input"]).float(), batch["target"])
+
+    def on_test_epoch_end(self) -> None:
+        self.log_metrics("test", self.test_metrics)
+
+    def log_metrics(self, stage: str, metrics: CloudMetrics) -> None:
+        # compute() has added up all processes; sync_dist then means over equal values
+        self.log_dict({f"{stage}/{name}": value for name, value in metrics.compute().items()}, sync_dist=True)
+        metrics.reset()
+
+    def configure_optimizers(self) -> OptimizerLRScheduler:
+        assert self.optimizer is not None
+        optimizer = self.optimizer(self.parameters())
+        if self.scheduler is None:
+            return optimizer
+        cls = getattr(self.scheduler, "func", self.scheduler)
+        horizon = {"total_steps", "T_max"} & inspect.signature(cls).parameters.keys()
+        if horizon and not math.isfinite(steps := self.trainer.estimated_stepping_batches):
+            raise ValueError(
+                "scheduler: needs to know the number of steps; give trainer.max_epochs or trainer.max_steps"
+            )
+        lengths: dict[str, Any] = {name: int(steps) for name in horizon}
+        try:
+            scheduler = self.scheduler(optimizer, **lengths)
+        except ZeroDivisionError:  # OneCycleLR with one step of warm-up, the first: then without
+            scheduler = self.scheduler(optimizer, **lengths, pct_start=0.5 / int(steps))
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}

@@ -1,0 +1,294 @@
+"""Densify whole clouds with a trained network: no Hydra, no Lightning, usable from a notebook."""
+
+import copy
+import hashlib
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from numbers import Integral, Real
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from pnu import __version__
+from pnu.fast import accelerated
+from pnu.geometry.attributes import carry
+from pnu.geometry.normal_estimation import complete_normals, estimate_normals
+from pnu.geometry.unit_sphere import Frame, unit_sphere_frame
+from pnu.io import Cloud, check_cloud
+from pnu.networks import checkpoints
+from pnu.runtime.parts import Parts
+from pnu.runtime.progress import Progress, silent
+from pnu.runtime.workers import Processes
+from pnu.upsamplers import CLASSICAL, Context, Upsampler, classical, upsampler_of
+from pnu.upsamplers.patches import with_unit_normals
+
+MINIMUM = 16  # points of a cloud
+LARGEST = 10**9  # points of an output
+
+
+def upsample(
+    points: np.ndarray,
+    normals: np.ndarray | None = None,
+    *,
+    ratio: float = 4,
+    model: nn.Module | Upsampler | str | PathLike[str] = "surface",
+    patch_size: int | None = None,
+    device: str = "auto",
+    devices: int = 1,
+    batch_size: int | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+    parts: str | PathLike[str] | None = None,
+) -> np.ndarray:
+    """A denser cloud on the same surface.
+
+    Networks of patches are used as in the paper (`pnu.upsamplers.patches`); "surface" and upsamplers without a network
+    take the cloud as a whole. Neither the order of the points nor repeated ones have an influence.
+
+    Args:
+        points: (n, 3), or (n, 6) with normals, n >= 16, in any unit and anywhere; an array, or a tensor on any device.
+            Points that are not finite, or at the place of another, are left out: n is the number of the others, and
+            `pnu.io.check_cloud` tells what it finds.
+        normals: (n, 3), of any length; estimated and oriented where missing, zero or NaN here and in points.
+        ratio: points out for each point in, any number >= 1.
+        model: network, run folder, file of weights, the name of weights that come with pnu (`pnu.weights`), "newest",
+            the run that finished last under outputs/, or an upsampler: "apss", "poisson", "midpoint", or one's own.
+            "surface" takes the weights made for estimated normals where none are given.
+        patch_size: points of a patch, at least 16; None: what the network was made for. "surface" has no patches.
+        device: "auto" (where the given network is; else CUDA where there is one), "cpu", "cuda", "cuda:1" ...
+        devices: CUDA devices, or processes on the CPU, that share the work of the network; the result is the same for
+            any number. More than one needs `if __name__ == "__main__":` in a script.
+        batch_size: patches at once on a GPU, by default 64; on the CPU each thread takes one. Of "surface": points at
+            once, by default 65536 on a GPU and 512 a thread on the CPU.
+        seed: of models that draw random numbers; the paper's procedure draws none.
+        progress: called as progress(stage, done, total).
+        parts: folder for finished parts of a long computation; the same call goes on from them after an interruption.
+
+    Returns:
+        (round(ratio n), 6) float64: points in the frame and unit of the input, and unit normals.
+
+    Raises:
+        ValueError: in one line, which argument is wrong and what was expected.
+
+    The network comes back as it was, modes and device too; generators and settings of torch are left alone.
+    """
+    given = _given(points, normals)
+    count = output_count(len(given.points), ratio)
+    sizes = (
+        ("patch_size", patch_size, MINIMUM),
+        ("batch_size", batch_size, 1),
+        ("devices", devices, 1),
+        ("seed", seed, 0),
+    )
+    for name, value, least in sizes:
+        if value is not None and not (isinstance(value, Integral) and value >= least):
+            raise ValueError(f"{name}={value}: expected a whole number >= {least}")
+    network, target = _on_device(*_model(model, given.normals), device)
+    upsampler = upsampler_of(network, patch_size)
+    if devices > 1 and not getattr(upsampler, "parallel", False):
+        raise ValueError(f"devices={devices}: {type(network).__name__} works in one process; leave devices=1")
+    names = _names(target, devices)
+    sparse, frame = _prepare(given, progress)
+    finished = Parts() if parts is None else Parts(Path(parts) / _digest(network, sparse, count, upsampler))
+    context = Context(target, batch_size, torch.Generator().manual_seed(seed), progress, finished)
+    with torch.no_grad(), evaluating(network), accelerated(modules_of(network)), ExitStack() as stack:
+        if torch.get_default_device().type != "cpu":
+            stack.enter_context(torch.device("cpu"))
+        if devices > 1:
+            context = replace(context, workers=stack.enter_context(Processes(copy.deepcopy(network).cpu(), names)))
+        raw = upsampler.upsample_cloud(sparse.to(target), count, context)
+        dense = with_unit_normals(raw.cpu().double(), sparse)
+    return frame.from_unit(dense[None])[0].numpy()
+
+
+def attributes(dense: np.ndarray, cloud: Cloud) -> dict[str, np.ndarray]:
+    """Colours and scalars of a cloud at the points of its denser version (m, 6), see `pnu.geometry.attributes`."""
+    if not cloud.attributes:
+        return {}
+    given = None if cloud.normals is None else torch.from_numpy(cloud.normals)
+    normals = complete_normals(torch.from_numpy(cloud.points), given).numpy()
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    sparse = np.hstack([cloud.points, normals / np.maximum(length, 1e-300)])
+    return {name: carry(dense, sparse, values) for name, values in cloud.attributes.items()}
+
+
+def output_count(n: int, ratio: float) -> int:
+    """round(ratio n), or `ValueError` for a ratio that is no number >= 1 or asks for more than 1e9 points."""
+    if not (isinstance(ratio, Real) and 1 <= ratio < float("inf")):
+        raise ValueError(f"ratio={_short(ratio)}: expected a number >= 1, the points out for each point in")
+    count = round(ratio * n)
+    if count > LARGEST:
+        raise ValueError(f"ratio={ratio:g}: asks for {count} points, at most {LARGEST:g} are made; lower it")
+    return count
+
+
+def normals(points: np.ndarray, neighbors: int = 16, *, progress: Progress = silent) -> np.ndarray:
+    """Normals of a cloud: estimated, and oriented outward on closed shapes, to one side on open ones.
+
+    Those of `upsample` where it gets none. They depend neither on the order of the points nor on repeated ones.
+
+    Args:
+        points: (n, 3), n >= 16, in any unit and anywhere; an array, or a tensor on any device.
+        neighbors: of the plane fits that begin it, at least 3.
+        progress: called as progress(stage, done, total).
+
+    Returns:
+        (n, 3) float64, of unit length; NaN for points that are not finite.
+
+    Raises:
+        ValueError: in one line, which argument is wrong and what was expected.
+    """
+    array = _array(points, "points: expected an array (n, 3)")
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"points: expected an array (n, 3), found shape {array.shape}")
+    different = check_cloud(Cloud(array, None, {}), "points", minimum=MINIMUM).points
+    different = different[np.lexsort(different.T)]
+    unit, _ = _unit_sphere(different)
+    if not (isinstance(neighbors, Integral) and 3 <= neighbors <= len(different)):
+        raise ValueError(
+            f"neighbors={neighbors}: expected a whole number from 3 to {len(different)}, the different points"
+        )
+    progress("normals", 0, 1)
+    estimated = estimate_normals(unit, int(neighbors))[0].numpy()
+    progress("normals", 1, 1)
+    finite = np.isfinite(array).all(1)
+    found = np.full(array.shape, np.nan)
+    found[finite] = estimated[cKDTree(different).query(array[finite])[1]]  # each point is one of them
+    return found
+
+
+def source(model: str | PathLike[str], normals: np.ndarray | None) -> str | PathLike[str]:
+    """What `checkpoint.load` takes, for a cloud with these normals: "surface" means one of two, "newest" a run."""
+    if model == "surface" and normals is None:
+        return "surface_estimated"
+    return checkpoints.resolve(model)
+
+
+def _given(points: np.ndarray, normals: np.ndarray | None) -> Cloud:
+    """The cloud that points (n, 3) or (n, 6) and normals (n, 3) describe, checked."""
+    expected = "points: expected an array (n, 3), or (n, 6) with normals"
+    array = _array(points, expected)
+    if array.ndim != 2 or array.shape[1] not in (3, 6):
+        raise ValueError(f"{expected}, found shape {array.shape}")
+    if array.shape[1] == 6:
+        if normals is not None:
+            raise ValueError("normals: are in points (n, 6) already; give points (n, 3), or no normals beside them")
+        array, normals = array[:, :3], array[:, 3:]
+    elif normals is not None:
+        normals = _array(normals, f"normals: expected an array {array.shape}")
+    return check_cloud(Cloud(array, normals, {}), "points", minimum=MINIMUM)
+
+
+def _array(values: Any, expected: str) -> np.ndarray:
+    """An array or a tensor, wherever it lies and whether or not it has a gradient, as float64."""
+    try:
+        if isinstance(values, Tensor):
+            values = values.detach().cpu().double().resolve_conj().resolve_neg().numpy()
+        if np.iscomplexobj(values):
+            raise ValueError("complex")
+        return np.asarray(values, np.float64)
+    except (ValueError, TypeError, RuntimeError, OverflowError):
+        raise ValueError(f"{expected}, found {type(values).__name__}") from None
+
+
+def _short(value: object) -> str:
+    return f"{value:g}" if isinstance(value, Real) else repr(value)[:40]
+
+
+def modules_of(model: object) -> list[nn.Module]:
+    """All modules of a network; of an upsampler without one, none."""
+    return list(model.modules()) if isinstance(model, nn.Module) else []
+
+
+@contextmanager
+def evaluating(model: object) -> Iterator[None]:
+    """A network in eval mode, each of its modules in its own mode again in the end."""
+    training = [module for module in modules_of(model) if module.training]
+    for module in training:
+        module.training = False
+    try:
+        yield
+    finally:
+        for module in training:
+            module.training = True
+
+
+def _model(model: Any, normals: np.ndarray | None) -> tuple[Any, bool]:
+    """The network or upsampler that is meant, and whether it is the caller's own."""
+    if not isinstance(model, str | PathLike):
+        return model, True
+    return (classical(str(model)) if model in CLASSICAL else checkpoints.load(source(model, normals))), False
+
+
+def _on_device(model: Any, given: bool, device: str) -> tuple[Any, torch.device]:
+    """The network on a device, and which; one that is given and lies elsewhere is copied, not moved."""
+    tensors = [tensor for module in modules_of(model) for tensor in (*module.parameters(False), *module.buffers(False))]
+    if device != "auto":
+        try:
+            torch.empty(0, device=device)
+        except (RuntimeError, AssertionError):
+            raise ValueError(f"device={device}: is not here; expected auto, cpu, or cuda where there is one") from None
+        target = torch.device(device)
+    elif given:
+        target = tensors[0].device if tensors else torch.device("cpu")
+    else:
+        target = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if all(tensor.device == target for tensor in tensors):
+        return model, target
+    return (copy.deepcopy(model) if given else model).to(target), target
+
+
+def _names(target: torch.device, devices: int) -> list[str]:
+    """Of as many devices as are asked for, of the kind of the target."""
+    if devices == 1 or target.type == "cpu":
+        return [str(target)] * devices
+    here = torch.cuda.device_count()
+    if devices > here:
+        raise ValueError(f"devices={devices}: expected at most {here}, as many CUDA devices as are here")
+    return [f"cuda:{number}" for number in range(devices)]
+
+
+def _digest(network: Any, sparse: Tensor, count: int, upsampler: object) -> str:
+    """Of all that the parts of a computation depend on."""
+    digest = hashlib.sha256(sparse.numpy().tobytes())
+    for name, value in network.state_dict().items() if modules_of(network) else ():
+        digest.update(name.encode() + value.cpu().numpy().tobytes())
+    plain = [
+        (name, value)
+        for module in (upsampler, *modules_of(network))
+        for name, value in sorted(vars(module).items())
+        if name != "training" and isinstance(value, int | float | str)
+    ]
+    digest.update(repr((type(network).__name__, count, plain, __version__, torch.__version__)).encode())
+    return digest.hexdigest()[:16]
+
+
+def _prepare(cloud: Cloud, progress: Progress) -> tuple[Tensor, Frame]:
+    """The points in a fixed order with normals, (n, 6) float64 in the unit sphere, and the way back."""
+    order = np.lexsort(cloud.points.T)
+    unit, frame = _unit_sphere(cloud.points[order])
+    given = None if cloud.normals is None else torch.from_numpy(cloud.normals[order])
+    if given is None or given.isnan().any():
+        progress("normals", 0, 1)
+        directions = complete_normals(unit[0], given)
+        progress("normals", 1, 1)
+    else:
+        directions = given
+    return torch.cat([unit[0], directions], 1), frame
+
+
+def _unit_sphere(points: np.ndarray) -> tuple[Tensor, Frame]:
+    """Points (n, 3) as (1, n, 3) in the unit sphere, and the way back."""
+    cloud = torch.from_numpy(points)[None]
+    frame = unit_sphere_frame(cloud)
+    unit = frame.to_unit(cloud)
+    extent = torch.linalg.svdvals(unit[0] - unit[0].mean(0))
+    if extent[1] < 1e-9 * extent[0]:
+        raise ValueError(f"points: all {len(points)} points lie on a line; expected points on a surface")
+    return unit, frame
