@@ -14,7 +14,7 @@ import pytest
 import torch
 from PIL import Image
 
-from pnu.commands.doctor import open3d_error
+from pnu.__main__ import verbs
 from pnu.commands.train import Train
 from pnu.config.compose import compose_config
 from pnu.data import shapes
@@ -22,6 +22,7 @@ from pnu.geometry.mesh_sampling import sample_area
 from pnu.io import read_cloud, read_mesh, write_cloud, write_mesh
 from pnu.networks.pnu import PNU
 from pnu.networks.released import rename
+from pnu.runtime.system_libraries import open3d_error
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("docs/**/*.md"))
@@ -29,14 +30,14 @@ PAGES += ["README.md", "data/README.md", "SECURITY.md"]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.M | re.S)
 WITH_BLOCKS = [page for page in PAGES if BLOCK.search((ROOT / page).read_text(encoding="utf-8"))]
 SHORT = {
-    "pnu.prepare": ["data.patches=91"],
-    "pnu.train": [
+    "prepare": ["data.patches=91"],
+    "train": [
         *("data.patches=91", "data.input_points=64", "data.target_points=256", "data.batch_size=4", "threads=1"),
         *("trainer.max_steps=2", "trainer.max_epochs=-1", "trainer.accelerator=cpu", "trainer.val_check_interval=1"),
         *("trainer.limit_val_batches=1", "trainer.limit_test_batches=1", "callbacks.pictures.clouds=0"),
     ],
-    "pnu.evaluate": ["shapes=[mug]", "kinds=[uniform]", "points=300", "truth_points=1200"],
-    "pnu.compare": ["shapes=[mug]", "kinds=[uniform]", "points=300", "truth_points=1200", "size=64"],
+    "evaluate": ["shapes=[mug]", "kinds=[uniform]", "points=300", "truth_points=1200"],
+    "compare": ["shapes=[mug]", "kinds=[uniform]", "points=300", "truth_points=1200", "size=64"],
 }
 CROPS = [
     *("data.validation=[mug]", "data.clouds=8", "data.size=128", "data.batch_size=4", "data.points=128", "threads=1"),
@@ -111,28 +112,33 @@ def filled(folder: Path, line: str) -> str:
 
 
 def run_line(folder: Path, line: str) -> None:
-    python, *arguments = shlex.split(filled(folder, line), comments=True)
-    if python == "make":
+    program, *arguments = shlex.split(filled(folder, line), comments=True)
+    if program == "make":
         run(ROOT, ["make", "--dry-run", *arguments])
         return
-    if python in ("torchrun", "srun"):  # GPUs, a cluster: at least the keys exist
+    if program in ("torchrun", "srun"):  # GPUs, a cluster: at least the keys exist
         compose_config(Train, arguments[arguments.index("pnu.train") + 1 :])
         return
-    assert python == "python", line
-    if arguments[1].startswith("bench"):  # minutes
-        run(ROOT, [sys.executable, *arguments[:2], "--help"])
-        return
+    if program == "python":
+        assert arguments[0] == "-m", line
+        if arguments[1].startswith("bench"):  # minutes
+            run(ROOT, [sys.executable, *arguments[:2], "--help"])
+            return
+        assert arguments[1] == "pnu.train", line
+        arguments = ["train", *arguments[2:]]
+    else:
+        assert program == "pnu", line
     if open3d_error():  # its system libraries are missing; tested in test_reconstruct.py
-        if arguments[1] == "pnu.reconstruct":
+        if arguments[0] == "reconstruct":
             return
         arguments = [argument.replace("poisson", "midpoint") for argument in arguments]
     given = {argument.partition("=")[0] for argument in arguments}
     if not given & {"describe", "resume"}:
-        short = CROPS if "ablation=surface" in arguments else SHORT.get(arguments[1], [])
+        short = CROPS if "ablation=surface" in arguments else SHORT.get(arguments[0], [])
         keep = {"shapes", "kinds", "points"} & given
         arguments += [option for option in short if option.partition("=")[0] not in keep]
         arguments += SWEPT if "ablation" in given else []
-    run(folder, [sys.executable, *arguments])
+    run(folder, [sys.executable, "-m", "pnu", *arguments])
 
 
 @pytest.fixture(scope="module")
@@ -178,6 +184,8 @@ def test_links_lead_somewhere(page: str) -> None:
 def test_modules_named_on_a_page_exist(page: str) -> None:
     for module in re.findall(r"python -m (pnu\.\w+)", text(page)):
         assert (ROOT / f"{module.replace('.', '/')}.py").is_file(), module
+    for verb in re.findall(r"^pnu (\w+)", text(page), re.M):
+        assert verb in verbs(), verb
 
 
 @pytest.mark.parametrize("own", [False, pytest.param(True, marks=pytest.mark.slow)])

@@ -19,11 +19,11 @@ from scipy.spatial.transform import Rotation
 import pnu
 from pnu import benchmark
 from pnu.commands import picture, reconstruct
-from pnu.commands.doctor import open3d_error
 from pnu.commands.upsample import main as upsample_main
 from pnu.data import shapes
 from pnu.geometry.mesh_sampling import closest_points, sample_area
 from pnu.io import read_cloud, read_mesh, write_cloud
+from pnu.runtime.system_libraries import open3d_error
 
 Array = np.ndarray
 MESH = shapes.make("mug")

@@ -18,13 +18,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import pnu
-from pnu.commands.doctor import open3d_error
 from pnu.commands.upsample import Upsample
 from pnu.config.compose import compose_config, parse
 from pnu.config.quoting import hydra_text, override, quoted, shell_line, typed, typed_line
 from pnu.data import shapes
 from pnu.geometry.mesh_sampling import sample_area
 from pnu.io import read_cloud, write_cloud, write_json, write_mesh
+from pnu.runtime.system_libraries import open3d_error
 from pnu.training import sweeps
 from pnu.training.run_folder import RunFolder
 from tests.test_docs import released_checkpoint
@@ -49,8 +49,8 @@ def words(line: str) -> list[str]:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_name_arrives_as_it_is(name: str) -> None:
-    python, option, module, argument, other = words(shell_line("upsample", input=name, output=[name, "x"]))
-    assert (python, option, module) == ("python", "-m", "pnu", "upsample")
+    program, verb, argument, other = words(shell_line("upsample", input=name, output=[name, "x"]))
+    assert (program, verb) == ("pnu", "upsample")
     assert parse([argument])[0].value() == name
     assert parse([other])[0].value() == [name, "x"]
     if name:
@@ -68,14 +68,14 @@ def test_values_that_are_no_names() -> None:
     given_values = [None, True, False, 3, 0.5, 1e-9, Path("a/b"), [1, "b c", None]]
     texts = ["null", "true", "false", "3", "0.5", "1e-09", "a/b", '[1,"b c",null]']
     assert [hydra_text(value) for value in given_values] == texts
-    assert shell_line("train", "-m", **{"data.path": "x.h5"}) == "python -m pnu.train -m data.path=x.h5"
+    assert shell_line("train", "-m", **{"data.path": "x.h5"}) == "pnu train -m data.path=x.h5"
 
 
 def test_what_was_typed_is_told_again() -> None:
     arguments = ["-m", f"run={hydra_text(NASTY)}", "seed=0,1"]
     assert typed_line() == ""
     with typed("train", arguments):
-        assert words(typed_line()) == ["python", "-m", "pnu.train", *arguments]
+        assert words(typed_line()) == ["pnu", "train", *arguments]
     assert typed_line() == ""
 
 
@@ -95,7 +95,7 @@ def texts_of(path: Path) -> list[str]:
     return [node.value for node in nodes if isinstance(node.value, str)]
 
 
-COMMAND = re.compile(r"\bpython3? .*-m\b|-m pnu|\bpnu[.-]\w+ (-m|[\w.]+=)")
+COMMAND = re.compile(r"\bpython3? .*-m\b|-m pnu|\bpnu[ .-]\w+ (-m|[\w.]+=)")
 
 
 def test_no_place_makes_a_command_without_quoting() -> None:
@@ -117,24 +117,24 @@ def test_the_search_for_commands_finds_them(tmp_path: Path) -> None:
 
 # where a line is made -> the test below that runs it
 PLACES = {
-    "prepare.py next_line": "test_from_patches_to_a_picture",
-    "run/table.py closing": "test_from_patches_to_a_picture",
-    "upsample.py upsample": "test_from_patches_to_a_picture",
-    "reconstruct.py reconstruct": "test_from_patches_to_a_picture",
-    "export.py export": "test_weights_kept_as_a_file",
-    "convert.py convert": "test_weights_of_the_released_code",
-    "evaluate.py evaluate": "test_an_evaluation_then_a_comparison",
-    "compare.py compare": "test_an_evaluation_then_a_comparison",
-    "compare.py upsamplers": "test_a_name_that_is_taken",
-    "run/folder.py recorded": "test_a_run_that_was_stopped",
-    "run/resume.py open_run": "test_a_finished_run_that_lost_its_last_checkpoint",
-    "run/sweep.py closing": "test_a_sweep_then_its_report",
-    "run/sweep.py run": "test_interrupted_with_a_launcher",  # in test_sweep.py
-    "run/command.py main": "test_interrupted_before_anything_is_made",
-    "run/command.py folder_arguments": "test_hydras_folder_is_the_run_folder",  # in test_train.py
-    "run/config.py parse": "test_hints_on_quotes",
-    "run/config.py check_single": "test_hints_on_quotes",
-    "study/settings.py collect": "test_a_sweep_then_its_report",
+    "commands/prepare.py next_line": "test_from_patches_to_a_picture",
+    "training/result_table.py closing": "test_from_patches_to_a_picture",
+    "commands/upsample.py upsample": "test_from_patches_to_a_picture",
+    "commands/reconstruct.py reconstruct": "test_from_patches_to_a_picture",
+    "commands/export.py export": "test_weights_kept_as_a_file",
+    "commands/convert.py convert": "test_weights_of_the_released_code",
+    "commands/evaluate.py evaluate": "test_an_evaluation_then_a_comparison",
+    "commands/compare.py compare": "test_an_evaluation_then_a_comparison",
+    "commands/compare.py upsamplers": "test_a_name_that_is_taken",
+    "training/run_folder.py recorded": "test_a_run_that_was_stopped",
+    "training/resuming.py open_run": "test_a_finished_run_that_lost_its_last_checkpoint",
+    "training/sweeps.py closing": "test_a_sweep_then_its_report",
+    "training/sweeps.py run": "test_interrupted_with_a_launcher",  # in test_sweep.py
+    "commands/_entry.py main": "test_interrupted_before_anything_is_made",
+    "commands/_entry.py folder_arguments": "test_hydras_folder_is_the_run_folder",  # in test_train.py
+    "config/compose.py parse": "test_hints_on_quotes",
+    "config/compose.py check_single": "test_hints_on_quotes",
+    "report/sweep_results.py collect": "test_a_sweep_then_its_report",
 }
 
 
@@ -154,7 +154,7 @@ def callers(path: Path) -> set[str]:
 def test_every_place_that_makes_a_line_is_run() -> None:
     paths = [path for path in PACKAGE.rglob("*.py") if path.name != "quoting.py"]
     found = {f"{path.relative_to(PACKAGE)} {name}" for path in paths for name in callers(path)}
-    found = {place.replace("command.py command", "command.py main") for place in found}
+    found = {place.replace("_entry.py command", "_entry.py main") for place in found}
     assert found == set(PLACES)
     tests = "".join(
         (Path(__file__).parent / name).read_text() for name in ("test_quoting.py", "test_sweep.py", "test_train.py")
@@ -170,10 +170,10 @@ Say = Callable[..., str]
 
 def paste(line: str, *more: str) -> str:
     """What a line prints that is pasted with `more` after it."""
-    python, option, module, *arguments = words(line)
-    assert (python, option) == ("python", "-m")
+    program, verb, *arguments = words(line)
+    assert program == "pnu"
     with redirect_stdout(io.StringIO()) as out:
-        importlib.import_module(module).main([*arguments, *more])
+        importlib.import_module(f"pnu.commands.{verb}").main([*arguments, *more])
     return out.getvalue()
 
 
@@ -289,10 +289,10 @@ def test_a_sweep_then_its_report(say: Say, trained: str) -> None:
     assert (folder / "report" / "report.html").is_file()
     typed_before = RunFolder(folder / "default_1").read_record()["command"]
     assert typed_before in (folder / "report" / "report.md").read_text()
-    assert words(typed_before)[:4] == ["python", "-m", "pnu.train", "data=patches"]
+    assert words(typed_before)[:3] == ["pnu", "train", "data=patches"]
     write_json(folder / "default_1" / "run.json", {"status": "failed"})
     with typed("train", ["-m", "seed=0,1"]):
-        assert printed(sweeps.closing(folder)) == "python -m pnu.train -m seed=0,1"  # nothing to report on
+        assert printed(sweeps.closing(folder)) == "pnu train -m seed=0,1"  # nothing to report on
 
 
 def test_interrupted_before_anything_is_made(

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnu.commands.doctor import open3d_error
 from pnu.data import shapes
 from pnu.geometry.mesh_sampling import sample_area
 from pnu.io import read_cloud, write_cloud, write_mesh
+from pnu.runtime.system_libraries import open3d_error
 from tests.test_docs import SHORT, released_checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]
