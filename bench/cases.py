@@ -7,7 +7,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from pnu.geometry.cloud_statistics import survey
+from pnu.geometry.cloud_statistics import describe_cloud
 from pnu.io import CLOUD_SUFFIXES, Cloud, files_of, read_cloud
 
 
@@ -20,7 +20,7 @@ def contents(cloud: Cloud) -> str:
 def row(path: Path) -> str:
     try:
         cloud = read_cloud(path)
-        read, said = contents(cloud), [*cloud.notes, *survey(cloud.points, cloud.normals).warnings()]
+        read, said = contents(cloud), [*cloud.notes, *describe_cloud(cloud.points, cloud.normals).warnings()]
     except (ValueError, OSError) as error:
         read, said = "refused", [str(error).removeprefix(f"{path}: ")]
     return f"| {path.name} | {read} | {'<br>'.join(said).replace('|', '/')} |"

@@ -200,7 +200,7 @@ def shares(ours: Callable[[], Tensor]) -> dict[str, float]:
         "gathers and their gradients": share(
             "index_select", "index", "embedding_bag", "_embedding_bag", "scatter_add_", "index_put_", "cat"
         ),
-        "maxima over neighbourhoods": share("amax", "eq", "addcmul_"),
+        "maxima over neighborhoods": share("amax", "eq", "addcmul_"),
     }
     return {**parts, "everything else": 100 - sum(parts.values())}
 

@@ -75,9 +75,9 @@ def read_patches(path: Path) -> None:
     import torch
 
     from pnu.data.patch_dataset import Options, PatchDataset
-    from pnu.data.patch_file import check, describe
+    from pnu.data.patch_file import check_patch_file, describe
 
-    contents = check(path)
+    contents = check_patch_file(path)
     describe(path)
     data = PatchDataset(path, range(contents.patches), Options(64, 64), seed=0, names=contents.names)
     for i in range(min(contents.patches, 4)):
@@ -223,9 +223,9 @@ MODEL = {"_target_": "pnu.networks.pnu.PNU", "ratio": 2, "local_features": False
 def checkpoint_files() -> list[bytes]:
     import torch
 
-    from pnu.networks import build
+    from pnu.networks import build_network
 
-    state = {f"model.{name}": value for name, value in build(MODEL).state_dict().items()}
+    state = {f"model.{name}": value for name, value in build_network(MODEL).state_dict().items()}
     made = []
     for more in ({}, {"epoch": 3, "global_step": 9, "optimizer_states": [{"lr": np.float64(0.1)}], "loops": {}}):
         torch.save({"state_dict": state, **more}, buffer := io.BytesIO())
@@ -236,9 +236,9 @@ def checkpoint_files() -> list[bytes]:
 
 def weight_files() -> list[bytes]:
     from pnu import weights
-    from pnu.networks import build
+    from pnu.networks import build_network
 
-    state = build(MODEL).state_dict()
+    state = build_network(MODEL).state_dict()
     return [written(".safetensors", lambda path: weights.write(path, MODEL, state))]
 
 
@@ -667,12 +667,12 @@ def child(names: list[str], cases: int, start: int, folder: Path) -> None:
     """Run the cases of readers; prints a line of JSON a reader: how many were refused, and what went wrong."""
     import torch
 
-    from pnu.networks import build, checkpoints
+    from pnu.networks import build_network, checkpoints
 
     torch.set_num_threads(1)
     if any(READERS[name].read in (read_checkpoint, read_weights, read_config) for name in names):
         for run in ("run", "run with config"):
-            checkpoints.save(folder / run, network := build(MODEL), MODEL, {})
+            checkpoints.save(folder / run, network := build_network(MODEL), MODEL, {})
         outputs_of(network.eval())  # loads what the first call loads
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + GIBIBYTE, used + GIBIBYTE))

@@ -63,13 +63,13 @@ def test_projection_lands_on_the_sphere_at_the_nearest_point() -> None:
     assert flat_normal.tolist() == [[0, 0, 1]]
 
 
-def test_degenerate_neighbourhoods_stay_finite() -> None:
+def test_degenerate_neighborhoods_stay_finite() -> None:
     same = torch.tensor([[1.0, 2, 3, 0, 0, 1]], dtype=torch.float64).repeat(20, 1)  # one point twenty times: its plane
     assert apss_project(torch.tensor([[1.0, 2.5, 4]], dtype=torch.float64), same).tolist() == [[1, 2.5, 3, 0, 0, 1]]
     opposite = same * torch.tensor([1.0, 1, 1, 1, 1, -1])
     query = torch.tensor([[1.0, 2, 4]], dtype=torch.float64)
     assert torch.isfinite(apss_project(query, torch.cat([same, opposite])[::2].contiguous(), k=20)).all()
-    assert torch.isfinite(apss_project(sphere(50)[:1, :3] * 0, sphere(50), k=50)).all()  # the centre of the sphere
+    assert torch.isfinite(apss_project(sphere(50)[:1, :3] * 0, sphere(50), k=50)).all()  # the center of the sphere
 
 
 def test_moves_with_the_cloud() -> None:
@@ -89,7 +89,7 @@ def test_moves_with_the_cloud() -> None:
 def test_chunks_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud, query = sphere(300), sphere(300)[:, :3] + 0.1 * noise(300)
     whole = apss_project(query, cloud, 8)
-    monkeypatch.setattr(algebraic_sphere, "CHUNK_NEIGHBOURS", 8 * 37)
+    monkeypatch.setattr(algebraic_sphere, "CHUNK_NEIGHBORS", 8 * 37)
     assert torch.equal(apss_project(query, cloud, 8), whole)
 
 
@@ -106,5 +106,5 @@ def test_bad_input() -> None:
         apss_project(cloud, cloud)
     with pytest.raises(ValueError, match=r"cloud: expected points and normals \(n, 6\), found \(20, 3\)"):
         apss_project(cloud[:, :3], cloud[:, :3])
-    with pytest.raises(ValueError, match=r"k: expected 4 to 20 neighbours .* found 21"):
+    with pytest.raises(ValueError, match=r"k: expected 4 to 20 neighbors .* found 21"):
         apss_project(cloud[:, :3], cloud, k=21)

@@ -50,14 +50,14 @@ def test_whole_numbers_are_rounded() -> None:
     assert carry(dense, sparse, np.array([0, 100]))[0] == round(100 * (1 - share)) == 16
 
 
-def test_point_that_faces_no_neighbour_takes_the_nearest() -> None:
+def test_point_that_faces_no_neighbor_takes_the_nearest() -> None:
     sparse, dense = plane(10), plane(5, up=-1.0)
     nearest = np.linalg.norm(dense[:, None, :3] - sparse[:, :3], axis=2).argmin(1)
     np.testing.assert_array_equal(carry(dense, sparse, np.arange(10)), nearest)
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd"])
-def test_colours_of_a_thin_sheet_reach_the_file(tmp_path, suffix: str) -> None:
+def test_colors_of_a_thin_sheet_reach_the_file(tmp_path, suffix: str) -> None:
     """Two sides a third of a spacing apart, red and blue, densified by the command itself."""
     sides = np.repeat([1.0, -1.0], 400)
     cloud = np.vstack([plane(400, 0.008), plane(400, -0.008, -1.0)])

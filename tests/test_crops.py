@@ -14,7 +14,7 @@ import torch
 from pnu.data import shapes
 from pnu.data.crop_module import ProjectionDataModule
 from pnu.data.crops import Crops, WholeClouds, flattened
-from pnu.data.mesh_scene import Truth
+from pnu.data.mesh_scene import MeshScene
 from pnu.geometry.mesh_sampling import closest_points, face_normals, sample_area
 from pnu.io import Mesh, write_mesh
 from pnu.losses.projection import SurfaceLoss
@@ -30,7 +30,7 @@ def meshes() -> dict[str, Mesh]:
 
 
 def test_truth_agrees_with_exact_closest_points(meshes: dict[str, Mesh]) -> None:
-    truth, rng = Truth(list(meshes.values())), np.random.default_rng(0)
+    truth, rng = MeshScene(list(meshes.values())), np.random.default_rng(0)
     order = [list(meshes)[i] for i in (2, 0, 1)]
     queries = np.stack([sample_area(meshes[name], 200, rng)[:, :3] for name in order])
     queries += 0.01 * rng.standard_normal(queries.shape)
@@ -47,7 +47,7 @@ def test_truth_agrees_with_exact_closest_points(meshes: dict[str, Mesh]) -> None
 
 
 def test_truth_can_be_sent_to_another_process(meshes: dict[str, Mesh]) -> None:
-    truth = Truth(list(meshes.values()))
+    truth = MeshScene(list(meshes.values()))
     query, index = torch.full((1, 1, 3), 0.9, dtype=torch.float64), torch.tensor([1])
     expected = truth.closest(query, index)
     for ours, theirs in zip(expected, pickle.loads(pickle.dumps(truth)).closest(query, index), strict=True):
@@ -58,7 +58,7 @@ def test_truth_can_be_sent_to_another_process(meshes: dict[str, Mesh]) -> None:
 def test_crops_repeat_and_lie_near_their_surface(meshes: dict[str, Mesh], normals: str) -> None:
     crops = Crops(meshes, 8, size=200, views=2, normals=normals, seed=3)
     again = Crops(meshes, 8, size=200, views=2, normals=normals, seed=3)
-    truth = Truth(list(meshes.values()))
+    truth = MeshScene(list(meshes.values()))
     for index in range(8):
         item, same, other = crops[0, index], again[0, index], crops[1, index]
         assert item["input"].shape == (2, 200, 6)
@@ -94,7 +94,7 @@ def test_validation_clouds_do_not_change(meshes: dict[str, Mesh]) -> None:
 
 
 def test_loss_is_zero_on_the_surface_and_grows_off_it(meshes: dict[str, Mesh]) -> None:
-    truth = Truth(list(meshes.values()))
+    truth = MeshScene(list(meshes.values()))
     batch = flattened([Crops(meshes, 4, size=80, views=2)[0, i] for i in range(4)])
     extra = {**batch, "surface": truth}
     loss = SurfaceLoss()

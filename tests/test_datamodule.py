@@ -13,7 +13,7 @@ import torch
 
 from pnu.data import shapes
 from pnu.data.patch_dataset import EpochSampler, Options, PatchDataset, split
-from pnu.data.patch_file import build
+from pnu.data.patch_file import cut_patch_file
 from pnu.data.patch_module import MeshDataModule, PatchDataModule, SyntheticDataModule
 from pnu.io import write_mesh
 
@@ -24,7 +24,7 @@ FOUR = ("washer", "dice", "nut", "cup")
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "four.h5"
-    build(path, {name: functools.partial(shapes.make, name) for name in FOUR}, 16)
+    cut_patch_file(path, {name: functools.partial(shapes.make, name) for name in FOUR}, 16)
     return path
 
 

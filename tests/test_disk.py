@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from pnu.networks import build, checkpoints
+from pnu.networks import build_network, checkpoints
 from pnu.networks.checkpoints import read
 from tests.test_cli import small  # noqa: F401  a fixture
 
@@ -85,7 +85,7 @@ def place(disk: Path) -> Path:
     """With a cloud and a run folder."""
     points = np.random.default_rng(0).normal(size=(500, 3))
     np.savetxt(disk / "cloud.xyz", points / np.linalg.norm(points, axis=1, keepdims=True))
-    checkpoints.save(disk / "run", build(PNU), PNU, {})
+    checkpoints.save(disk / "run", build_network(PNU), PNU, {})
     return disk
 
 

@@ -46,7 +46,7 @@ def mlp(*widths: int, bias: bool = True) -> MLP:
 
 
 def neighbors(clouds: int, m: int, n: int, k: int) -> Tensor:
-    """Random neighbourhoods (clouds, m, k) of 1 to k distinct points, filled up with copies of the first."""
+    """Random neighborhoods (clouds, m, k) of 1 to k distinct points, filled up with copies of the first."""
     found = torch.rand(clouds, m, n).argsort(-1)[..., :k].sort(-1).values
     number = torch.randint(1, k + 1, (clouds, m, 1))
     return torch.where(torch.arange(k) < number, found, found[..., :1])
@@ -70,12 +70,12 @@ def run(
 
 @pytest.mark.parametrize("projected", [False, True])
 @pytest.mark.parametrize("bias", [False, True])
-@pytest.mark.parametrize("grouping", ["none", "whole", "neighbours"])
+@pytest.mark.parametrize("grouping", ["none", "whole", "neighbors"])
 def test_training_equals_layers(monkeypatch: pytest.MonkeyPatch, grouping: str, bias: bool, projected: bool) -> None:
     network = mlp(7, 16, 12, 20, bias=bias)
     x = torch.randn(3 * 50, 16 if projected else 7, dtype=torch.float64)
     groups = plainly = whole(3, 50) if grouping == "whole" else None
-    if grouping == "neighbours":
+    if grouping == "neighbors":
         idx = neighbors(3, 40, 50, 8)
         groups, plainly = distinct(idx, 50), single(idx, 50)
         assert len(groups.source) < 0.8 * len(plainly.source)
@@ -101,7 +101,7 @@ def test_equal_maxima_share_the_gradient(monkeypatch: pytest.MonkeyPatch) -> Non
 @pytest.mark.parametrize("depth", [1, 3])
 @pytest.mark.parametrize("training", [False, True])
 def test_differences_of_tables_equal_layers(monkeypatch: pytest.MonkeyPatch, training: bool, depth: int) -> None:
-    """Rows that are made where they are needed, of points and centres, against rows that are stored."""
+    """Rows that are made where they are needed, of points and centers, against rows that are stored."""
     network = mlp(*(7, 16, 12, 20)[: depth + 1]).train(training)
     idx = neighbors(3, 40, 50, 8)
     table = torch.randn(150, 16, dtype=torch.float64, requires_grad=True)
@@ -203,7 +203,7 @@ def test_eval_mode_takes_one_row() -> None:
     assert accelerate(mlp(3, 5, 4)).eval()(torch.randn(1, 3, dtype=torch.float64)).isfinite().all()
 
 
-def test_distinct_neighbours() -> None:
+def test_distinct_neighbors() -> None:
     idx = torch.tensor([[[3, 3, 3], [0, 2, 0], [1, 2, 3]]])
     groups = distinct(idx, 4)
     assert groups.runs == [(1, 1), (1, 2), (1, 3)]
@@ -213,8 +213,8 @@ def test_distinct_neighbours() -> None:
     assert groups.multiplicity.tolist() == [3, 2, 1, 1, 1, 1]
 
 
-def _synchronised(rank: int, folder: str, x: Tensor, plainly: bool) -> None:
-    """One of two processes, which hold an uneven part each, with synchronised batch norm."""
+def _synchronized(rank: int, folder: str, x: Tensor, plainly: bool) -> None:
+    """One of two processes, which hold an uneven part each, with synchronized batch norm."""
     store = torch.distributed.FileStore(str(Path(folder) / "store"), 2)
     torch.distributed.init_process_group("gloo", store=store, rank=rank, world_size=2, timeout=timedelta(seconds=60))
     network = synchronize(mlp(7, 16, 12))
@@ -230,10 +230,10 @@ def _synchronised(rank: int, folder: str, x: Tensor, plainly: bool) -> None:
 
 
 @pytest.mark.parametrize("plainly", [False, True])
-def test_synchronised_batch_norm(plainly: bool, tmp_path: Path) -> None:
+def test_synchronized_batch_norm(plainly: bool, tmp_path: Path) -> None:
     """Two processes compute what one does with all rows, chunk by chunk or layer by layer."""
     x = torch.randn(150, 7, dtype=torch.float64)
-    torch.multiprocessing.spawn(_synchronised, (str(tmp_path), x, plainly), nprocs=2)
+    torch.multiprocessing.spawn(_synchronized, (str(tmp_path), x, plainly), nprocs=2)
     network = mlp(7, 16, 12)
     output = network(x)
     output.square().sum().backward()
@@ -249,7 +249,7 @@ def test_errors_in_threads_are_raised() -> None:
         raise RuntimeError(f"chunk {part[0].number}")
 
     with pytest.raises(RuntimeError, match="chunk 0"):
-        cache.spread(fail, cache.row_chunks(100, 100))
+        cache.map_chunks(fail, cache.row_chunks(100, 100))
     assert torch.get_num_threads() == 2
 
 
@@ -352,7 +352,7 @@ NETWORKS = {
 def test_a_fast_network_equals_the_plain_one(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setattr(cache, "CHUNK", 2**15)
     torch.manual_seed(0)
-    plain = networks.build({"_target_": f"pnu.networks.{name}", **NETWORKS[name]}).double()
+    plain = networks.build_network({"_target_": f"pnu.networks.{name}", **NETWORKS[name]}).double()
     patch = torch.cat([cloud(2, 70)[..., :3], nn.functional.normalize(cloud(2, 70)[..., 3:6], dim=-1)], -1).double()
     fast = accelerate(copy.deepcopy(plain))
     assert {type(part) for part in fast.modules()} & FORMS.keys() == set()
@@ -391,7 +391,7 @@ def test_the_switch_is_off_where_it_is_not_wanted(monkeypatch: pytest.MonkeyPatc
 def test_training_and_inference_are_fast(monkeypatch: pytest.MonkeyPatch) -> None:
     from pnu.training.lightning_module import UpsamplingModule
 
-    module = UpsamplingModule(networks.build({"_target_": "pnu.networks.pnu.PNU"}), CompoundLoss())
+    module = UpsamplingModule(networks.build_network({"_target_": "pnu.networks.pnu.PNU"}), CompoundLoss())
     assert type(module.model.local_features.abstractions[0]) is forms.Abstraction
     assert type(module.loss) is FORMS[CompoundLoss]
     used = []
@@ -399,7 +399,7 @@ def test_training_and_inference_are_fast(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(
         forms, "through", lambda mlp, *args, **options: used.append(mlp) or through(mlp, *args, **options)
     )
-    network = networks.build({"_target_": "pnu.networks.pnu.PNU", "local_features": False})
+    network = networks.build_network({"_target_": "pnu.networks.pnu.PNU", "local_features": False})
     pnu.upsample(cloud(1, 100)[0].double().numpy()[:, :3], ratio=2, model=network)
     assert network.head in used
     assert type(network.head) is JoinedMLP

@@ -55,7 +55,7 @@ def test_interpolate_by_hand() -> None:
     assert interpolate(features, points, points).flatten().tolist() == pytest.approx([0, 9, 7], abs=1e-5)
 
 
-def test_interpolate_with_fewer_points_than_neighbours() -> None:
+def test_interpolate_with_fewer_points_than_neighbors() -> None:
     assert interpolate(torch.ones(1, 1, 2), torch.zeros(1, 1, 3), random(1, 4, 3).float()).tolist() == [[[1, 1]] * 4]
 
 

@@ -72,7 +72,7 @@ def test_map_coordinates_keep_their_millimetres(tmp_path: Path, cloud: tuple[Arr
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 def test_lidar_files_in_slices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
-    """Colours, lidar's own scalars and others; laspy reads the same; a missing laspy is named with its cure."""
+    """Colors, lidar's own scalars and others; laspy reads the same; a missing laspy is named with its cure."""
     import laspy
 
     monkeypatch.setattr("pnu.io.las.SLICE", 7)
@@ -102,7 +102,7 @@ def test_lidar_files_in_slices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd"])
 @pytest.mark.parametrize("channels", [3, 4])
-def test_colours_and_scalars_are_kept(tmp_path: Path, cloud: tuple[Array, Array], suffix: str, channels: int) -> None:
+def test_colors_and_scalars_are_kept(tmp_path: Path, cloud: tuple[Array, Array], suffix: str, channels: int) -> None:
     rng = np.random.default_rng(1)
     attributes = {
         "colors": rng.integers(0, 256, (40, channels), dtype=np.uint8),
@@ -143,7 +143,7 @@ def test_text_separators_and_comments(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_cloud(path).points, points)
 
 
-def test_six_columns_of_text_are_normals_or_colours(tmp_path: Path, cloud: tuple[Array, Array]) -> None:
+def test_six_columns_of_text_are_normals_or_colors(tmp_path: Path, cloud: tuple[Array, Array]) -> None:
     points, normals = cloud
     path = tmp_path / "c.xyz"
     np.savetxt(path, np.hstack([points, normals]), "%.4f")

@@ -128,7 +128,7 @@ def around(prediction: Tensor, matches: Matches) -> Tensor:
     ],
 )
 def test_gradients(term: Callable[[Tensor, Tensor, Matches], Tensor]) -> None:
-    """Of each term, with the neighbours held."""
+    """Of each term, with the neighbors held."""
     prediction, target = clouds(2, 12, 9)
     matches = search(prediction, target, 4)
     assert torch.autograd.gradcheck(lambda p: term(p, target, matches), prediction.requires_grad_())
@@ -144,7 +144,7 @@ def test_fast_loss_equals_the_plain_one(
     dtype: torch.dtype,
     tolerance: float,
 ) -> None:
-    """Values and gradients of the three neighbourhood terms in one pass, also of degenerate points."""
+    """Values and gradients of the three neighborhood terms in one pass, also of degenerate points."""
     monkeypatch.setattr(terms, "PIECE", 20)
     prediction, _ = clouds(3, 50, 1)
     prediction[0, 1, :3] = prediction[0, 0, :3]
@@ -252,7 +252,7 @@ def test_emd_replaces_chamfer() -> None:
         ({"normal_pairs": 3}, "loss.normal_pairs: expected one of target, prediction, found 3"),
         ({"orth": "none"}, "loss.orth: expected one of absolute, signed"),
         ({"near_ties": ""}, "loss.near_ties: expected one of released, exact"),
-        ({"k": 0}, "loss.k: expected at least 1 neighbour, found 0"),
+        ({"k": 0}, "loss.k: expected at least 1 neighbor, found 0"),
     ],
 )
 def test_bad_options(options: dict[str, object], text: str) -> None:

@@ -12,7 +12,7 @@ from reference import ball_query
 from torch import Tensor, nn
 
 from pnu.fast import accelerate
-from pnu.networks import build
+from pnu.networks import build_network
 from pnu.networks.pnu import PNU, levels
 from pnu.networks.pnu_paper import RADII, PNUPaper
 from pnu.networks.released import from_released
@@ -101,7 +101,7 @@ def test_paper_features_are_maxima_over_radii() -> None:
 @pytest.mark.parametrize("ratio", [2, 4, 8, 16])
 @pytest.mark.parametrize("n", [64, 101])
 def test_shapes(name: str, ratio: int, n: int) -> None:
-    network = build({"_target_": f"pnu.networks.{name}", "ratio": ratio})
+    network = build_network({"_target_": f"pnu.networks.{name}", "ratio": ratio})
     assert network.ratio == ratio
     output = network(patches(2, n))
     assert output.shape == (2, n * ratio, 6)
@@ -206,20 +206,20 @@ def test_bad_input() -> None:
 )
 def test_build_only_networks(target: str, text: str) -> None:
     with pytest.raises(ValueError, match=text):
-        build({"_target_": target})
+        build_network({"_target_": target})
 
 
 def test_older_targets_are_built() -> None:
     """Run folders and weights from before `pnu.networks` had its name say `pnu.models`."""
-    assert type(build({"_target_": "pnu.models.pnu.PNU", "ratio": 2})) is PNU
+    assert type(build_network({"_target_": "pnu.models.pnu.PNU", "ratio": 2})) is PNU
     with pytest.raises(ValueError, match="'pnu.networks.layers.torch' is no network"):
-        build({"_target_": "pnu.models.layers.torch"})
+        build_network({"_target_": "pnu.models.layers.torch"})
 
 
 def test_build_arguments() -> None:
     with pytest.raises(ValueError, match="PNU does not accept these arguments: .*'depth'"):
-        build({"_target_": "pnu.networks.pnu.PNU", "depth": 3})
-    assert isinstance(build({"_target_": "pnu.networks.pnu_paper.PNUPaper", "ratio": 2}), PNUPaper)
+        build_network({"_target_": "pnu.networks.pnu.PNU", "depth": 3})
+    assert isinstance(build_network({"_target_": "pnu.networks.pnu_paper.PNUPaper", "ratio": 2}), PNUPaper)
 
 
 def test_released_names() -> None:

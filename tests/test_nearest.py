@@ -1,4 +1,4 @@
-"""Neighbour searches against loops, in trees and in chunks."""
+"""Neighbor searches against loops, in trees and in chunks."""
 
 from functools import partial
 from types import ModuleType
@@ -107,7 +107,7 @@ def test_every_float_on_a_gpu_takes_the_kernels(dtype: torch.dtype, monkeypatch:
     assert torch.equal(found.idx.as_subclass(Tensor), module._knn_tree(points, points, 4).idx)
 
 
-def test_permuted_targets_give_the_same_neighbours() -> None:
+def test_permuted_targets_give_the_same_neighbors() -> None:
     query, target = cloud(1, 40, seed=4), cloud(1, 70, seed=5)
     order = torch.randperm(70, generator=torch.Generator().manual_seed(6))
     before, after = knn(query, target, 8), knn(query, target[:, order], 8)
@@ -156,14 +156,14 @@ def test_ball_query_by_hand() -> None:
 @pytest.mark.parametrize(
     ("call", "text"),
     [
-        (lambda q, t: knn(q, t, 8), "k: expected 1 to 7 neighbours (the number of target points), found 8"),
-        (lambda q, t: knn(q, t, 0), "k: expected 1 to 7 neighbours (the number of target points), found 0"),
+        (lambda q, t: knn(q, t, 8), "k: expected 1 to 7 neighbors (the number of target points), found 8"),
+        (lambda q, t: knn(q, t, 0), "k: expected 1 to 7 neighbors (the number of target points), found 0"),
         (lambda q, t: knn(q[0], t, 1), r"query: expected points of shape (B, n, 3), found (5, 3)"),
         (lambda q, t: knn(q, t[..., :2], 1), r"target: expected points of shape (B, n, 3), found (2, 7, 2)"),
         (lambda q, t: knn(q, t[:1], 1), "target: expected 2 clouds, one for each of the query, found 1"),
         (lambda q, t: nearest(q, t[:, :0]), "target: expected at least one point, found none"),
         (lambda q, t: ball_query(q, t, 0.0, 4), "radius: expected a positive distance, found 0.0"),
-        (lambda q, t: ball_query(q, t, 0.1, 0), "k: expected at least 1 neighbour, found 0"),
+        (lambda q, t: ball_query(q, t, 0.1, 0), "k: expected at least 1 neighbor, found 0"),
     ],
 )
 def test_bad_input(call, text: str) -> None:  # type: ignore[no-untyped-def]
@@ -192,5 +192,5 @@ def test_a_search_again_and_again() -> None:
         found, expected = search.knn(query, k), knn(query[None], target[None], k)
         torch.testing.assert_close(found.idx, expected.idx[0], rtol=0, atol=0)
         torch.testing.assert_close(found.dist_sq, expected.dist_sq[0], rtol=0, atol=0)
-    with pytest.raises(ValueError, match="k: expected 1 to 50 neighbours"):
+    with pytest.raises(ValueError, match="k: expected 1 to 50 neighbors"):
         search.knn(target, 51)

@@ -155,11 +155,11 @@ def test_page_in_a_browser(tmp_path: Path) -> None:
 
 @needs_browser
 @pytest.mark.parametrize(
-    ("fragment", "red", "grey"),
+    ("fragment", "red", "gray"),
     [("item=ours&form=points&mode=errors", True, False), ("item=truth&form=surfaces&mode=errors", False, True)],
 )
-def test_viewer_draws(tmp_path: Path, fragment: str, red: bool, grey: bool) -> None:
-    """A ball in the middle of the view: red and blue errors of points; the truth, which has none, grey."""
+def test_viewer_draws(tmp_path: Path, fragment: str, red: bool, gray: bool) -> None:
+    """A ball in the middle of the view: red and blue errors of points; the truth, which has none, gray."""
     write_page(tmp_path / "a.html", "Comparison", {}, [view()])
     page = np.asarray(
         Image.open(browse(tmp_path / "a.html", fragment, tmp_path / "profile", picture=True)).convert("RGB")
@@ -170,7 +170,7 @@ def test_viewer_draws(tmp_path: Path, fragment: str, red: bool, grey: bool) -> N
     drawn = middle[middle.min(1) < 230]
     assert len(drawn) > 2000
     assert bool((drawn[:, 0] > drawn[:, 2] + 90).mean() > 0.05) == red
-    assert bool((np.ptp(drawn, axis=1) < 30).mean() > 0.9) == grey
+    assert bool((np.ptp(drawn, axis=1) < 30).mean() > 0.9) == gray
 
 
 def test_figures_are_embedded(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Patches: centres far apart, nearest points, every point covered, merged to an exact count."""
+"""Patches: centers far apart, nearest points, every point covered, merged to an exact count."""
 
 import numpy as np
 import pytest
@@ -55,7 +55,7 @@ def test_merge_gives_exactly_n_different_points_evenly() -> None:
 def test_bad_input() -> None:
     with pytest.raises(ValueError, match="m: expected 1 to 10 points"):
         extract(cloud(10), 11, 4)
-    with pytest.raises(ValueError, match="k: expected 1 to 10 neighbours"):
+    with pytest.raises(ValueError, match="k: expected 1 to 10 neighbors"):
         extract(cloud(10), 2, 11)
     with pytest.raises(ValueError, match="m: expected 1 to 20 points"):
         merge(torch.rand(2, 10, 3), 21)

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from pnu.data import shapes
-from pnu.data.patch_file import build, check, cut_patches, describe, different
+from pnu.data.patch_file import check_patch_file, cut_patch_file, cut_patches, describe, different
 from pnu.geometry.mesh_sampling import closest_points, face_normals
 from pnu.io import Mesh
 
@@ -20,7 +20,7 @@ MAKERS = {name: functools.partial(shapes.make, name) for name in ("washer", "dic
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("patches") / "two.h5"
-    build(path, MAKERS, 5, parameters={"source": "test"})
+    cut_patch_file(path, MAKERS, 5, parameters={"source": "test"})
     return path
 
 
@@ -60,13 +60,13 @@ def test_file_has_the_documented_datasets(file: Path) -> None:
         assert [name.decode() for name in opened["name"][()]] == ["dice"] * 3 + ["washer"] * 2
         length = np.linalg.norm(opened["poisson_4096"][:, :, 3:], axis=-1)
     assert np.allclose(length, 1, atol=1e-5)
-    contents = check(file)
+    contents = check_patch_file(file)
     assert (contents.patches, contents.points, contents.has_edges, contents.has_input) == (5, 4096, True, False)
     assert contents.parameters == {"source": "test"}
 
 
 def test_same_patches_with_two_processes(file: Path, tmp_path: Path) -> None:
-    build(tmp_path / "again.h5", MAKERS, 5, processes=2)
+    cut_patch_file(tmp_path / "again.h5", MAKERS, 5, processes=2)
     with h5py.File(file) as one, h5py.File(tmp_path / "again.h5") as two:
         assert np.array_equal(one["poisson_4096"][()], two["poisson_4096"][()])
         assert np.array_equal(one["edges"][()], two["edges"][()], equal_nan=True)
@@ -77,7 +77,7 @@ def test_failure_leaves_no_file(tmp_path: Path) -> None:
         raise ValueError("no faces")
 
     with pytest.raises(ValueError, match="^zebra: no faces$"):
-        build(tmp_path / "out.h5", {"dice": MAKERS["dice"], "zebra": broken}, 2)
+        cut_patch_file(tmp_path / "out.h5", {"dice": MAKERS["dice"], "zebra": broken}, 2)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -139,7 +139,7 @@ def test_foreign_file_is_refused_with_what_it_lacks(tmp_path: Path, content: dic
         for name, value in content.items():
             opened[name] = value
     with pytest.raises(ValueError, match=message) as raised:
-        check(path)
+        check_patch_file(path)
     assert str(raised.value).startswith(str(path))
     assert "\n" not in str(raised.value)
 
@@ -191,7 +191,7 @@ def test_every_patch_is_checked_and_the_row_named(
         if name in opened:
             del opened[name]
         opened[name] = with_fault(fault, row)
-    for function in (check, describe):
+    for function in (check_patch_file, describe):
         with pytest.raises(ValueError, match=f"one.h5: patch {row} of {name} {message} mend or remove it$"):
             function(path)
 
@@ -202,12 +202,12 @@ def test_edges_are_points_or_empty(tmp_path: Path, value: list[float]) -> None:
     edges[:, 0] = 0.5
     with h5py.File(tmp_path / "edges.h5", "w") as opened:
         opened["poisson_4096"], opened["edges"] = cloud(70), edges
-    assert check(tmp_path / "edges.h5").has_edges
+    assert check_patch_file(tmp_path / "edges.h5").has_edges
     edges[66, 1] = value
     with h5py.File(tmp_path / "edges.h5", "r+") as opened:
         opened["edges"][...] = edges
     with pytest.raises(ValueError, match=r"edges.h5: patch 66 of edges holds infinity, or NaN in a part of a row"):
-        check(tmp_path / "edges.h5")
+        check_patch_file(tmp_path / "edges.h5")
 
 
 def test_different_points_are_counted() -> None:
@@ -223,12 +223,12 @@ def test_a_file_is_read_once_until_it_changes(tmp_path: Path, monkeypatch: pytes
     path = tmp_path / "two.h5"
     with h5py.File(path, "w") as opened:
         opened["poisson_4096"] = cloud()
-    assert check(path) is check(path)
+    assert check_patch_file(path) is check_patch_file(path)
     with h5py.File(path, "r+") as opened:
         opened["poisson_4096"][1, 3] = np.nan
     os.utime(path, ns=(1, 1))
     with pytest.raises(ValueError, match="patch 1"):
-        check(path)
+        check_patch_file(path)
 
 
 def test_meshes_with_open_edges_are_counted_in_the_file(tmp_path: Path) -> None:
@@ -236,33 +236,33 @@ def test_meshes_with_open_edges_are_counted_in_the_file(tmp_path: Path) -> None:
         mesh = shapes.make("dice")
         return Mesh(mesh.vertices, mesh.faces[1:])
 
-    build(tmp_path / "three.h5", {**MAKERS, "hole": opened_dice}, 4)
-    assert check(tmp_path / "three.h5").open_edges == {"dice": 0, "hole": 3, "washer": 0}
+    cut_patch_file(tmp_path / "three.h5", {**MAKERS, "hole": opened_dice}, 4)
+    assert check_patch_file(tmp_path / "three.h5").open_edges == {"dice": 0, "hole": 3, "washer": 0}
     assert describe(tmp_path / "three.h5")["meshes_with_open_edges"] == "1 of 3: hole (3)"
 
 
 def test_no_file_and_no_hdf5(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no such file"):
-        check(tmp_path / "none.h5")
+        check_patch_file(tmp_path / "none.h5")
     (tmp_path / "text.h5").write_text("not a file of patches")
     with pytest.raises(ValueError, match="expected an HDF5 file of patches"):
-        check(tmp_path / "text.h5")
+        check_patch_file(tmp_path / "text.h5")
 
 
 def test_damaged_and_forged_files_are_refused(file: Path, tmp_path: Path) -> None:
     short = tmp_path / "short.h5"
     short.write_bytes(file.read_bytes()[:-100_000])
     with pytest.raises(ValueError, match=r"short.h5: expected an HDF5 file of patches, found .* a damaged file"):
-        check(short)
+        check_patch_file(short)
     with h5py.File(tmp_path / "forged.h5", "w") as opened:  # a terabyte, none of it written
         opened.create_dataset("poisson_4096", (10, 2**32, 6), "f4", chunks=(1, 4096, 6))
     with pytest.raises(ValueError, match=r"poisson_4096 claims the shape \(10, 4294967296, 6\), more than the file"):
-        check(tmp_path / "forged.h5")
+        check_patch_file(tmp_path / "forged.h5")
     with h5py.File(tmp_path / "names.h5", "w") as opened:
         opened["poisson_4096"] = cloud()
         opened.create_dataset("name", (10**12,), h5py.string_dtype(), chunks=(1000,))
     with pytest.raises(ValueError, match="name claims the shape"):
-        check(tmp_path / "names.h5")
+        check_patch_file(tmp_path / "names.h5")
 
 
 @pytest.mark.parametrize("value", ["no JSON", "[1, 2]", 5])
@@ -270,9 +270,9 @@ def test_foreign_parameters_do_no_harm(tmp_path: Path, value: object) -> None:
     with h5py.File(tmp_path / "foreign.h5", "w") as opened:
         opened["poisson_4096"] = cloud()
         opened.attrs["parameters"] = value
-    assert check(tmp_path / "foreign.h5").parameters == {}
+    assert check_patch_file(tmp_path / "foreign.h5").parameters == {}
 
 
 def test_too_few_patches() -> None:
     with pytest.raises(ValueError, match="at least one for each of the 2 shapes, found 1"):
-        build("never.h5", MAKERS, 1)
+        cut_patch_file("never.h5", MAKERS, 1)

@@ -1,4 +1,4 @@
-"""Pictures: what is visible, where, in which colour; and figures put together from them."""
+"""Pictures: what is visible, where, in which color; and figures put together from them."""
 
 from pathlib import Path
 
@@ -99,7 +99,7 @@ def test_mesh_covers_its_projection_and_shades_with_light_from_above() -> None:
     np.testing.assert_array_equal(picture[2, 2], 255)
 
 
-def test_inside_is_drawn_in_another_colour() -> None:
+def test_inside_is_drawn_in_another_color() -> None:
     mesh = octahedron()
     outside = render_mesh(mesh, camera=FRONT, size=60)[30, 25].astype(int)
     inside = render_mesh(Mesh(mesh.vertices, mesh.faces[:, ::-1]), camera=FRONT, size=60)[30, 25].astype(int)
@@ -107,7 +107,7 @@ def test_inside_is_drawn_in_another_colour() -> None:
     assert inside[0] - inside[2] > 20
 
 
-def test_vertex_colours_are_interpolated() -> None:
+def test_vertex_colors_are_interpolated() -> None:
     mesh = Mesh(np.array([[-1.0, -1, 0], [1, -1, 0], [-1, 1, 0], [1, 1, 0]]), np.array([[0, 1, 2], [1, 3, 2]]))
     colors = np.array([[255, 0, 0], [0, 0, 255], [255, 0, 0], [0, 0, 255]], np.uint8)
     row = render_mesh(mesh, colors, camera=FRONT, size=64)[32].astype(int)
@@ -135,7 +135,7 @@ def test_creases_are_split() -> None:
     np.testing.assert_allclose(vertices[faces], hull.vertices[hull.faces])
 
 
-def test_cloud_shows_normals_as_colours_and_hides_the_far_side() -> None:
+def test_cloud_shows_normals_as_colors_and_hides_the_far_side() -> None:
     cloud = sphere(3000)
     seen = render_cloud(cloud, camera=FRONT, size=200)
     middle = seen[90:110, 90:110].reshape(-1, 3).astype(int)
@@ -311,7 +311,7 @@ def test_a_color_bar_is_as_high_as_asked_and_cut_to_its_ink() -> None:
         np.testing.assert_array_equal(picture, draw_colorbar(bar, height, 18))
 
 
-def test_error_colours_run_from_red_to_blue() -> None:
+def test_error_colors_run_from_red_to_blue() -> None:
     red, green, blue = value_colors(np.array([-1.0, 0.6, 9.0]), (0, 1)).astype(int)
     assert red.argmax() == 0
     assert green.argmax() == 1
@@ -323,7 +323,7 @@ def test_error_colours_run_from_red_to_blue() -> None:
         value_colors(np.zeros(1), (1, 1))
 
 
-def test_perceptual_colours_grow_evenly_lighter() -> None:
+def test_perceptual_colors_grow_evenly_lighter() -> None:
     rgb = linear_light(value_colors(np.linspace(0, 1, 100), (0, 1), "perceptual") / 255)
     lightness = (np.cbrt(rgb @ np.linalg.inv(RGB).T) @ np.linalg.inv(LMS).T)[:, 0]
     steps = np.diff(lightness)
@@ -337,7 +337,7 @@ def test_srgb_and_back() -> None:
     assert srgb(np.array(0.2140)) == pytest.approx(0.5, abs=1e-3)
 
 
-def test_normal_colours() -> None:
+def test_normal_colors() -> None:
     np.testing.assert_array_equal(normal_colors(np.array([[1.0, 0, -1]])), [[255, 128, 0]])
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from pnu.commands.prepare import main
 from pnu.data import shapes
-from pnu.data.patch_file import check
+from pnu.data.patch_file import check_patch_file
 from pnu.data.patch_module import PatchDataModule
 from pnu.io import Mesh, write_mesh
 from tests.commands import refused
@@ -38,7 +38,7 @@ def prepare(folder: Path, *overrides: str) -> None:
 def test_meshes_become_a_file_that_training_takes(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     prepare(folder, "quiet=true", f"output={folder / 'mine/patches.h5'}")
     assert capsys.readouterr().out.strip() == str(folder / "mine/patches.h5")
-    contents = check(folder / "mine/patches.h5")
+    contents = check_patch_file(folder / "mine/patches.h5")
     assert contents.names == ["sub_dice", "washer"]
     (cached,) = (folder / "cache").iterdir()
     assert cached.read_bytes() == (folder / "mine/patches.h5").read_bytes()

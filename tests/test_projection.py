@@ -53,7 +53,7 @@ def turn() -> Tensor:
     return rotation_matrix(1, generator=torch.Generator().manual_seed(3))[0].double()
 
 
-def neighbourhoods(cloud: Tensor, query: Tensor, k: int) -> tuple[Tensor, Tensor, Tensor]:
+def neighborhoods(cloud: Tensor, query: Tensor, k: int) -> tuple[Tensor, Tensor, Tensor]:
     near = cloud[torch.cdist(query[:, :3], cloud[:, :3]).topk(k, largest=False).indices]
     return near[..., :3] - query[:, None, :3], near[..., 3:], query[:, 3:]
 
@@ -61,20 +61,20 @@ def neighbourhoods(cloud: Tensor, query: Tensor, k: int) -> tuple[Tensor, Tensor
 def test_frame_finds_the_sphere() -> None:
     cloud = sphere(400)
     query = 1.05 * cloud[:50]
-    frame = local_frames(*neighbourhoods(cloud, torch.cat([query[:, :3], cloud[:50, 3:]], 1), 24))
+    frame = local_frames(*neighborhoods(cloud, torch.cat([query[:, :3], cloud[:50, 3:]], 1), 24))
     foot = query[:, :3] + frame.base
     torch.testing.assert_close(foot, cloud[:50, :3], atol=1e-9, rtol=0)
     torch.testing.assert_close(frame.axes[:, 2], cloud[:50, 3:], atol=1e-9, rtol=0)
     identity = torch.eye(3, dtype=torch.float64).expand(50, 3, 3)
     torch.testing.assert_close(frame.axes @ frame.axes.mT, identity, atol=1e-12, rtol=0)
-    # each neighbour's plane, bent evenly, passes through the foot: the sphere is exact
+    # each neighbor's plane, bent evenly, passes through the foot: the sphere is exact
     torch.testing.assert_close(frame.features[..., 7], torch.zeros(50, 24, dtype=torch.float64), atol=1e-9, rtol=0)
 
 
 def test_features_do_not_see_place_rotation_and_size(turn: Tensor) -> None:
     cloud = wavy(400)
     other = moved(cloud, turn, 250.0, torch.tensor([1e3, -2e3, 5.0], dtype=torch.float64))
-    ours, theirs = (local_frames(*neighbourhoods(c, c[:60], 24)) for c in (cloud, other))
+    ours, theirs = (local_frames(*neighborhoods(c, c[:60], 24)) for c in (cloud, other))
     torch.testing.assert_close(theirs.features, ours.features, atol=1e-6, rtol=0)
     torch.testing.assert_close(theirs.spacing, 250 * ours.spacing)
     torch.testing.assert_close(theirs.axes, ours.axes @ turn.T, atol=1e-6, rtol=0)
@@ -86,7 +86,7 @@ def test_tangent_basis_is_orthonormal_for_every_axis() -> None:
     torch.testing.assert_close(frame @ frame.mT, torch.eye(3).expand(26, 3, 3), atol=1e-6, rtol=0)
 
 
-def test_discs_lie_in_tangent_planes_and_reach_the_ranked_neighbour() -> None:
+def test_discs_lie_in_tangent_planes_and_reach_the_ranked_neighbor() -> None:
     cloud = wavy(300)
     points, normals = cloud[:, :3], cloud[:, 3:]
     seeds = tangent_discs(points, normals, 9, rank=5)
@@ -131,7 +131,7 @@ def test_repulsion_leaves_the_two_sides_of_a_sheet_alone() -> None:
 
 def test_projector_starts_at_the_sphere_fit() -> None:
     cloud = sphere(500)
-    offsets, normals, hint = neighbourhoods(cloud, torch.cat([0.97 * cloud[:40, :3], cloud[:40, 3:]], 1), 24)
+    offsets, normals, hint = neighborhoods(cloud, torch.cat([0.97 * cloud[:40, :3], cloud[:40, 3:]], 1), 24)
     step, normal, _, _ = Projector().double()(offsets, normals, hint)
     torch.testing.assert_close((0.97 * cloud[:40, :3] + step).norm(dim=1), torch.ones(40, dtype=torch.float64))
     assert (normal * cloud[:40, 3:]).sum(1).min() > 0.99
@@ -165,7 +165,7 @@ def test_count_is_exact(count: int) -> None:
 
 @pytest.mark.parametrize("n", [16, 17, 40])
 def test_small_clouds(n: int) -> None:
-    dense = upsample(trained(neighbours=32, reach=48), sphere(n), 4 * n)
+    dense = upsample(trained(neighbors=32, reach=48), sphere(n), 4 * n)
     assert dense.shape == (4 * n, 6)
     assert torch.isfinite(dense).all()
 
@@ -180,7 +180,7 @@ def test_projector_is_the_same_with_and_without_gradient() -> None:
     torch.manual_seed(0)
     projector = Projector().double()
     torch.nn.init.normal_(projector.out.weight, std=0.3)
-    around = neighbourhoods(sphere(200), sphere(50), 24)
+    around = neighborhoods(sphere(200), sphere(50), 24)
     with torch.no_grad():
         lean = projector(*around)
     for a, b in zip(lean, projector(*around), strict=True):
@@ -188,7 +188,7 @@ def test_projector_is_the_same_with_and_without_gradient() -> None:
 
 
 def test_feet_are_those_of_the_frames() -> None:
-    around = neighbourhoods(sphere(200), sphere(50) * 1.1, 12)
+    around = neighborhoods(sphere(200), sphere(50) * 1.1, 12)
     step, normal = feet(*around)
     frame = local_frames(*around)
     torch.testing.assert_close(step, frame.base)
@@ -211,23 +211,23 @@ def test_outputs_carry_gradients_to_every_weight() -> None:
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in model.parameters())
 
 
-def test_far_neighbours_are_thinned_out() -> None:
-    ranks = Surface(neighbours=32, reach=48).ranks(1000)
+def test_far_neighbors_are_thinned_out() -> None:
+    ranks = Surface(neighbors=32, reach=48).ranks(1000)
     assert ranks[:16] == list(range(16))
     assert len(ranks) == len(set(ranks)) == 32
     assert ranks[-1] == 47
     assert Surface().ranks(10) == list(range(10))
 
 
-def test_reach_below_neighbours_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"model\.reach=20: expected at least model\.neighbours=24"):
-        Surface(neighbours=24, reach=20)
+def test_reach_below_neighbors_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"model\.reach=20: expected at least model\.neighbors=24"):
+        Surface(neighbors=24, reach=20)
 
 
 def test_parts_can_be_left_out() -> None:
     cloud = wavy(200)
     query = torch.cat([cloud[:30, :3] + 0.05 * cloud[:30, 3:], cloud[:30, 3:]], 1)
-    offsets, normals, hint = neighbourhoods(cloud, query, 24)
+    offsets, normals, hint = neighborhoods(cloud, query, 24)
     frame = local_frames(offsets, normals, hint, sphere=False)
     assert not frame.base.any()
     torch.testing.assert_close(frame.axes[:, 2], hint)
@@ -258,7 +258,7 @@ def test_most_doubtful_points_are_dropped(monkeypatch: pytest.MonkeyPatch) -> No
     assert torch.pdist(dropped).min() > torch.cdist(dropped, points[:, :3]).sort(1).values[:, 4].min()
 
 
-def test_of_doubtful_neighbours_the_worst_is_dropped() -> None:
+def test_of_doubtful_neighbors_the_worst_is_dropped() -> None:
     """A row of bad points does not become a hole, and a bad point elsewhere does not stay for their sake."""
     x, y = torch.meshgrid(torch.arange(20.0), torch.arange(20.0), indexing="ij")
     grid = torch.stack([x, y, torch.zeros_like(x)], -1).flatten(0, 1)

@@ -16,7 +16,7 @@ from tests.test_surfaces import icosphere, sphere_points
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a cloud with colours, its true mesh, and the mesh that the command makes of them."""
+    """A folder with a cloud with colors, its true mesh, and the mesh that the command makes of them."""
     folder = tmp_path_factory.mktemp("surface")
     cloud = sphere_points(1500)
     colors = np.where(cloud[:, :1] > 0, [[200, 30, 30]], [[30, 30, 200]]).astype(np.uint8)
@@ -55,7 +55,7 @@ def test_mesh_and_its_errors(folder: Path) -> None:
     )
 
 
-def test_colours_of_the_cloud_and_trimming(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_colors_of_the_cloud_and_trimming(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(reconstruct, input=folder / "cloud.ply", output=tmp_path / "a.ply", depth=5, trim=0.2)
     said = capsys.readouterr().out
     mesh = read_cloud(tmp_path / "a.ply")
@@ -130,7 +130,7 @@ def test_picture_of_files(folder: Path, tmp_path: Path, capsys: pytest.CaptureFi
     height, width = image.shape[:2]
     assert width > 2.5 * height
     plain = image[:, int(0.62 * width) : int(0.8 * width)]
-    assert np.ptp(plain, axis=2).max() < 20  # the true surface is grey
+    assert np.ptp(plain, axis=2).max() < 20  # the true surface is gray
     run(picture, inputs=f"[{files}]", output=tmp_path / "b.png", size=100, color="plain", columns=1, captions="[a,b,c]")
     tall = np.asarray(Image.open(tmp_path / "b.png"))
     assert tall.shape[0] > 2.5 * tall.shape[1]

@@ -272,7 +272,7 @@ def test_report_of_a_real_sweep(swept: Path) -> None:
     assert row["differs"] == "loss.w2=0, loss.w3=0, loss.w4=0, loss.w5=0"
     assert "2 settings, 2 seeds each, 4 finished runs" in (folder / "report.md").read_text()
     picture = np.asarray(Image.open(folder / cloud).convert("RGB"))
-    assert (np.ptp(picture.reshape(-1, 3).astype(int), axis=1) > 60).mean() > 0.01  # coloured by normals
+    assert (np.ptp(picture.reshape(-1, 3).astype(int), axis=1) > 60).mean() > 0.01  # colored by normals
     curves = (folder / "curves.svg").read_text()
     for word in ("val/chamfer_sq", "val/normal_deg", "step", "0 default", "1 cd"):
         assert word in curves
@@ -406,7 +406,7 @@ def test_curves_of_all_runs_have_the_same_names(ask: Callable[..., Any], swept: 
     assert {Path(run).parts[0] for run in tags} == {path.parent.name for path in swept.glob("*/run.json")}
 
 
-def test_clouds_are_served_with_points_and_colours(ask: Callable[..., Any]) -> None:
+def test_clouds_are_served_with_points_and_colors(ask: Callable[..., Any]) -> None:
     tags = ask("data/plugin/mesh/tags")
     assert len(tags) == 4
     run, clouds = next(iter(tags.items()))

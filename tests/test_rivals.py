@@ -15,7 +15,7 @@ NETWORKS = {"punet.PUNet": 3, "ecnet.ECNet": 3, "pugeo.PUGeo": 6}
 
 def network(name: str, ratio: int = 4) -> nn.Module:
     torch.manual_seed(0)
-    return networks.build({"_target_": f"pnu.networks.{name}", "ratio": ratio})
+    return networks.build_network({"_target_": f"pnu.networks.{name}", "ratio": ratio})
 
 
 def patch(batch: int = 2, n: int = 128) -> Tensor:
@@ -82,7 +82,7 @@ def test_pugeo_maps_2d_samples_to_the_tangent_plane() -> None:
 
 
 def test_repulsion_by_hand() -> None:
-    """Three points in a row, one neighbour each: distances 0.1, 0.1 and 0.2; h is meant for 4096 points."""
+    """Three points in a row, one neighbor each: distances 0.1, 0.1 and 0.2; h is meant for 4096 points."""
     points = torch.tensor([[[0.0, 0, 0], [0.1, 0, 0], [0.3, 0, 0]]], dtype=torch.float64)
     terms = RepulsionLoss(w_repulsion=0.5, h=0.02 * 3 / 4096, k=1)(points, points)
     expected = -(2 * 0.1 * math.exp(-0.01 / 0.02) + 0.2 * math.exp(-0.04 / 0.02)) / 3
@@ -127,7 +127,7 @@ def test_edge_terms_by_hand() -> None:
 
 
 def test_repulsion_of_edge_aware_loss_by_hand() -> None:
-    """A square of side 0.1 with h = 0.12 for four points: both neighbours are within, the diagonal is not."""
+    """A square of side 0.1 with h = 0.12 for four points: both neighbors are within, the diagonal is not."""
     corners = torch.tensor([[[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0]]], dtype=torch.float64)
     cloud = torch.cat([corners, torch.tensor([0.0, 0, 1]).expand(1, 4, 3)], -1)
     extra = {"edges": torch.full((1, 1, 3), math.nan).double(), "edge_distance": torch.ones(1, 4).double()}

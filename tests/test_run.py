@@ -17,8 +17,8 @@ import pnu
 from pnu.commands._entry import command, renamed
 from pnu.commands.train import Train
 from pnu.config.compose import compose_config, composer, config_folder, flatten, variations
-from pnu.config.instantiate import build
-from pnu.config.schema import check, doc, fields, groups, known_keys, nearest_key, unsaid_keys
+from pnu.config.instantiate import instantiate
+from pnu.config.schema import checked_config, doc, fields, groups, known_keys, nearest_key, unsaid_keys
 from pnu.training.run_folder import RunFolder, config_hash, new_path
 
 COMMANDS = sorted(path.stem for path in config_folder().glob("*.yaml") if path.stem != "command")
@@ -141,8 +141,8 @@ def test_a_value_that_must_be_given_is_asked_for() -> None:
         input: str = doc("file to read")
 
     with pytest.raises(ValueError, match=r"^input=\.\.\. is required: file to read$"):
-        check(OmegaConf.create({"input": "???"}), Need)
-    assert OmegaConf.is_missing(check(OmegaConf.create({"input": "???"}), Need, complete=False), "input")
+        checked_config(OmegaConf.create({"input": "???"}), Need)
+    assert OmegaConf.is_missing(checked_config(OmegaConf.create({"input": "???"}), Need, complete=False), "input")
 
 
 def test_nearest_key_of_several() -> None:
@@ -310,11 +310,11 @@ def test_build_and_partial() -> None:
 
     layer = torch.nn.Linear(2, 1)
     config = {"_target_": "torch.optim.Adam", "_partial_": True, "lr": 0.5}
-    optimizer = build(config, "torch.optim")(layer.parameters())
+    optimizer = instantiate(config, "torch.optim")(layer.parameters())
     assert isinstance(optimizer, torch.optim.Adam)
     assert optimizer.defaults["lr"] == 0.5
-    assert build({}, "torch.optim") is None
-    assert build(None, "torch.optim") is None
+    assert instantiate({}, "torch.optim") is None
+    assert instantiate(None, "torch.optim") is None
 
 
 @pytest.mark.parametrize(
@@ -333,12 +333,12 @@ def test_build_and_partial() -> None:
 )
 def test_build_refuses_what_the_package_does_not_define(target: str) -> None:
     with pytest.raises(ValueError, match=r"expected a class of torch\.optim"):
-        build({"_target_": target}, "torch.optim")
+        instantiate({"_target_": target}, "torch.optim")
 
 
 def test_build_names_a_wrong_argument() -> None:
     with pytest.raises(ValueError, match=r"torch\.optim\.Adam: .*rate"):
-        build({"_target_": "torch.optim.Adam", "rate": 1}, "torch.optim", params=[])
+        instantiate({"_target_": "torch.optim.Adam", "rate": 1}, "torch.optim", params=[])
 
 
 # --- run folder ---

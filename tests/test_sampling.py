@@ -149,7 +149,7 @@ def test_without_strength_the_draw_is_uniform() -> None:
 
 
 def test_first_draw_follows_the_weights() -> None:
-    # a line of 5 points; with one centre c the weight of point i is exp(-strength |i - c| / max |j - c|)
+    # a line of 5 points; with one center c the weight of point i is exp(-strength |i - c| / max |j - c|)
     points = torch.zeros(1, 5, 3)
     points[0, :, 0] = torch.arange(5)
     draws = 20_000
@@ -202,7 +202,7 @@ def test_poisson_disk_points_keep_their_distance() -> None:
         ),
         (
             lambda p: nonuniform_points(p, 3, strength=1, centers=9, generator=generator()),
-            "centers: expected 1 to 8 centres, found 9",
+            "centers: expected 1 to 8 centers, found 9",
         ),
     ],
 )

@@ -16,7 +16,7 @@ import yaml
 import pnu.io
 from pnu.commands import evaluate
 from pnu.data import patch_file, shapes
-from pnu.networks import build, checkpoints
+from pnu.networks import build_network, checkpoints
 from tests.commands import refused
 
 PNU = {"_target_": "pnu.networks.pnu.PNU", "ratio": 2, "local_features": False}
@@ -82,7 +82,7 @@ ATTACKS = {
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    checkpoints.save(tmp_path / "run", build(PNU), PNU, {})
+    checkpoints.save(tmp_path / "run", build_network(PNU), PNU, {})
     return tmp_path / "run"
 
 

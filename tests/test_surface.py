@@ -121,7 +121,7 @@ def test_closest_points_on_a_mesh_of_many_faces() -> None:
     np.testing.assert_allclose(distance, np.abs(np.hypot(ring, queries[:, 2]) - 0.3), atol=2e-3)
 
 
-def test_closest_points_from_the_centre_of_a_sphere() -> None:
+def test_closest_points_from_the_center_of_a_sphere() -> None:
     sphere = mesh(trimesh.creation.icosphere(3))
     _, distance, _ = closest_points(sphere, np.zeros((20, 3)))  # every face is a candidate of every query
     planes = (face_normals(sphere) * sphere.vertices[sphere.faces[:, 0]]).sum(1)

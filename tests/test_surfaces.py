@@ -203,7 +203,7 @@ def test_errors_in_both_directions_see_a_missing_half() -> None:
     assert errors.from_truth.max() == pytest.approx(np.sqrt(2), abs=0.05)  # from the lower pole to the equator
 
 
-def test_error_colours() -> None:
+def test_error_colors() -> None:
     errors = reconstruction.SurfaceErrors(np.array([0.0, 1, 2]), np.zeros(3), np.zeros(3), 1.0)
     red, _, blue = errors.colors(limit=2).astype(int)
     assert red.argmax() == 0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pnu.geometry.cloud_statistics import survey
+from pnu.geometry.cloud_statistics import describe_cloud
 
 RNG = np.random.default_rng(0)
 
@@ -15,7 +15,7 @@ def sphere(n: int) -> np.ndarray:
 
 def test_spacing_of_a_grid() -> None:
     grid = np.stack(np.meshgrid(np.arange(30.0), np.arange(30.0), [0.0]), -1).reshape(-1, 3)
-    found = survey(grid)
+    found = describe_cloud(grid)
     assert found.middle == pytest.approx(1, abs=0.15)
     assert not found.uneven
     assert found.noise < 1e-6
@@ -26,7 +26,7 @@ def test_spacing_of_a_grid() -> None:
 def test_noise_and_units(factor: float) -> None:
     clean = sphere(4000)
     noisy = clean + 0.01 * RNG.normal(size=clean.shape)
-    quiet, loud = survey(factor * clean), survey(factor * noisy, clean)
+    quiet, loud = describe_cloud(factor * clean), describe_cloud(factor * noisy, clean)
     assert loud.noise == pytest.approx(0.01 * factor, rel=0.4)
     assert quiet.noise < 0.002 * factor
     assert quiet.middle == pytest.approx(factor * np.sqrt(4 * np.pi / 4000), rel=0.1)
@@ -37,18 +37,18 @@ def test_noise_and_units(factor: float) -> None:
 def test_uneven_clouds_are_told() -> None:
     points = sphere(20_000)
     kept = RNG.random(len(points)) < np.where(points[:, 2] > 0, 0.5, 0.1)
-    assert survey(points[kept]).uneven
-    assert "uneven" in str(survey(points[kept]))
-    assert not survey(points[::4]).uneven
+    assert describe_cloud(points[kept]).uneven
+    assert "uneven" in str(describe_cloud(points[kept]))
+    assert not describe_cloud(points[::4]).uneven
 
 
 def test_the_smallest_cloud() -> None:
-    assert np.isfinite(survey(sphere(16))[:]).all()
+    assert np.isfinite(describe_cloud(sphere(16))[:]).all()
 
 
-def test_noise_is_a_number_where_no_neighbours_look_the_same_way() -> None:
-    normals = np.eye(3)[np.arange(20) % 3]  # at most seven of the 16 neighbours have the normal of a place
-    assert survey(sphere(20), normals).noise == 0
+def test_noise_is_a_number_where_no_neighbors_look_the_same_way() -> None:
+    normals = np.eye(3)[np.arange(20) % 3]  # at most seven of the 16 neighbors have the normal of a place
+    assert describe_cloud(sphere(20), normals).noise == 0
 
 
 def cube(n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -68,31 +68,31 @@ def test_normals_that_contradict_each_other() -> None:
     """f of all flipped: 2 f (1 - f) of the pairs. Neither edges nor the two sides of a thin plate do that."""
     shapes = {"sphere": (sphere(2000),) * 2, "cube": cube(2000), "plate": plate(2000, 0.01)}
     for points, normals in shapes.values():
-        assert not survey(points, normals).warnings()
+        assert not describe_cloud(points, normals).warnings()
     for name in ("sphere", "cube"):
         points, normals = shapes[name]
         for flipped in (0.1, 0.5):
             wrong = normals * np.where(RNG.random((2000, 1)) < flipped, -1, 1)
-            found = survey(points, wrong)
+            found = describe_cloud(points, wrong)
             assert found.contradicting == pytest.approx(2 * flipped * (1 - flipped), abs=0.04)
             (line,) = found.warnings()
-            assert f"{found.contradicting:.0%} of neighbouring normals contradict each other; normals=estimate" in line
+            assert f"{found.contradicting:.0%} of neighboring normals contradict each other; normals=estimate" in line
 
 
 def test_a_point_far_from_all_others_is_named() -> None:
     points = sphere(500)
-    assert survey(points).far == 0
+    assert describe_cloud(points).far == 0
     points[17] = [1e6, 0, 0]
-    found = survey(points)
+    found = describe_cloud(points)
     assert (found.far, found.farthest) == (1, 17)
     assert any(line.startswith("1 of the points lie far from all others (number 18") for line in found.warnings())
     two = np.vstack([sphere(500), sphere(500) + [9, 0, 0]])  # two things are no outliers
-    assert survey(two).far == 0
+    assert describe_cloud(two).far == 0
 
 
 def test_some_normals_may_be_missing() -> None:
     points = sphere(2000)
     normals = np.where(RNG.random((2000, 1)) < 0.1, np.nan, points)
-    found, all_known = survey(points, normals), survey(points, points)
+    found, all_known = describe_cloud(points, normals), describe_cloud(points, points)
     assert found.noise == pytest.approx(all_known.noise, rel=0.5)
     assert found.contradicting == 0

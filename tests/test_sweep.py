@@ -16,7 +16,7 @@ import yaml
 
 from pnu.commands.train import Train, main
 from pnu.config.compose import compose_config, composer, config_folder
-from pnu.config.schema import check
+from pnu.config.schema import checked_config
 from pnu.io import read_json, write_json
 from pnu.training.run_folder import RunFolder
 from pnu.training.sweeps import arguments, check_job, label_of, sweep_name
@@ -60,9 +60,9 @@ def metrics(folder: Path) -> dict[str, dict]:
 @pytest.mark.parametrize("ablation", ABLATIONS)
 def test_every_setting_changes_the_config_of_its_ablation(ablation: str) -> None:
     with composer("train") as compose:
-        default = check(compose([f"ablation={ablation}", "setting=default"]), Train)
+        default = checked_config(compose([f"ablation={ablation}", "setting=default"]), Train)
         for setting in params(ablation)["setting"][1:]:
-            cfg = check(compose([f"ablation={ablation}", f"setting={setting}"]), Train)
+            cfg = checked_config(compose([f"ablation={ablation}", f"setting={setting}"]), Train)
             changed = yaml.safe_load((config_folder() / "setting" / f"{setting}.yaml").read_text())
             assert cfg != default
             for group in changed.keys() - {"defaults"}:

@@ -192,7 +192,7 @@ def test_tensorboard_has_curves_clouds_pictures_config_and_hparams(finished: Pat
     assert "w1: 1.0" in text
 
 
-def test_clouds_of_tensorboard_are_capped_and_coloured_by_normal(finished: Path) -> None:
+def test_clouds_of_tensorboard_are_capped_and_colored_by_normal(finished: Path) -> None:
     from tensorboard.util import tensor_util
 
     found = events(finished)
@@ -203,7 +203,7 @@ def test_clouds_of_tensorboard_are_capped_and_coloured_by_normal(finished: Path)
     assert colors.shape == (1, 86, 3)
     outward = points[0] / np.linalg.norm(points[0], axis=1, keepdims=True)
     shown = colors[0].astype(float) / 127.5 - 1
-    assert ((outward * shown).sum(1) > 0.8).mean() > 0.9  # normals of ellipsoids look away from the centre
+    assert ((outward * shown).sum(1) > 0.8).mean() > 0.9  # normals of ellipsoids look away from the center
 
 
 def test_hyperparameters_come_with_final_metrics(finished: Path) -> None:

@@ -112,7 +112,7 @@ def test_names_are_models(name: str) -> None:
 @pytest.mark.parametrize("make", [lambda: Midpoint(0), lambda: APSS(3), lambda: APSS(seeds=1), lambda: APSS(reach=1)])
 def test_too_few_neighbors_are_refused(make: Callable[[], object]) -> None:
     """They would give no points, and without new ones midpoints go on for ever."""
-    with pytest.raises(ValueError, match=r"^(neighbours|seeds|reach)=\d: expected at least \d$"):
+    with pytest.raises(ValueError, match=r"^(neighbors|seeds|reach)=\d: expected at least \d$"):
         make()
 
 

@@ -12,7 +12,7 @@ from pnu.commands.export import main
 from pnu.networks import checkpoints
 from pnu.networks.surface import Surface
 
-MODEL = {"_target_": "pnu.networks.surface.Surface", "neighbours": 12, "reach": 12, "width": 16}
+MODEL = {"_target_": "pnu.networks.surface.Surface", "neighbors": 12, "reach": 12, "width": 16}
 
 
 @pytest.fixture
@@ -20,7 +20,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A working folder with a run."""
     monkeypatch.chdir(tmp_path)
     torch.manual_seed(0)
-    checkpoints.save(tmp_path / "run", Surface(neighbours=12, reach=12, width=16), MODEL, {})
+    checkpoints.save(tmp_path / "run", Surface(neighbors=12, reach=12, width=16), MODEL, {})
     return tmp_path
 
 
@@ -30,7 +30,7 @@ def test_exported_weights_are_those_of_the_run(place: Path, capsys: pytest.Captu
     ours, theirs = pnu.load("run"), pnu.load("small.safetensors")
     assert isinstance(theirs, Surface)
     assert not theirs.training
-    assert theirs.neighbours == 12
+    assert theirs.neighbors == 12
     for name, value in ours.state_dict().items():
         assert torch.equal(theirs.state_dict()[name], value)
     assert sorted(path.name for path in place.iterdir()) == ["run", "small.safetensors"]

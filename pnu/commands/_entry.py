@@ -56,7 +56,7 @@ from pnu.config.compose import (
     variations,
 )
 from pnu.config.help_text import help_text
-from pnu.config.schema import check, fields
+from pnu.config.schema import checked_config, fields
 from pnu.training import optuna_search, sweeps
 from pnu.training.run_folder import INTERRUPTED, is_main_process
 
@@ -81,7 +81,7 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
             cfg, left = fitted(cfg, hydra, schema, hydra.overrides.task)
             if left and not cfg.get("quiet"):
                 print(said(left, hydra.runtime.choices), file=sys.stderr)
-            return function(check(cfg, schema))
+            return function(checked_config(cfg, schema))
         except Exception as error:
             expected = isinstance(error, ValueError | OSError)
             if full_errors() or not (expected or in_multirun()):

@@ -56,7 +56,7 @@ class Compare:
 
 
 def compare(cfg: Any) -> None:
-    check(cfg)
+    check_options(cfg)
     from pnu import benchmark, metrics
     from pnu.report import comparison_page
     from pnu.training.run_folder import versions
@@ -181,7 +181,7 @@ def runs_of_sweep(method: str) -> list[str]:
     return [f"{run.path.name.rpartition('_')[0]}:{run.path}" for run in finished]
 
 
-def check(cfg: Any) -> None:
+def check_options(cfg: Any) -> None:
     """Refuse what can be refused before anything is loaded."""
     from pnu.rendering.colors import COLORMAPS
 

@@ -53,7 +53,7 @@ class Evaluate:
 
 
 def evaluate(cfg: Any) -> None:
-    check(cfg)
+    check_options(cfg)
     from pnu import benchmark, io, metrics
     from pnu.geometry.mesh_sampling import closest_points
     from pnu.metrics import ray_casting
@@ -108,7 +108,7 @@ def evaluate(cfg: Any) -> None:
         print(f"next:   {shell_line('compare', methods=[subject, rival], **data)}")
 
 
-def check(cfg: Any) -> None:
+def check_options(cfg: Any) -> None:
     """Refuse what can be refused before anything is loaded."""
     for key, known in (("normals", tuple(NORMALS)), ("search", ("exact", "open3d"))):
         if cfg[key] not in known:

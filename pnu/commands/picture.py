@@ -20,8 +20,8 @@ class Picture:
     columns: str | None = doc("panels in a row, null: all, up to six; or, as x,y,z,_,r,g,b, those of text files")
     color: str = doc("auto: the first that a file has; quality: scalar of that name; stored; normal; plain")
     colormap: str = doc("of quality. error: red = zero to blue = high; perceptual: dark to light")
-    limit: float | None = doc("quality at the end of the colours; null: what 98 % of the points stay below")
-    label: str = doc("of the colour bar")
+    limit: float | None = doc("quality at the end of the colors; null: what 98 % of the points stay below")
+    label: str = doc("of the color bar")
     fit: int | None = doc(
         "panel whose camera shows all, counted from 1; 0: all of them together; null: 1, each its own if elsewhere"
     )

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from pnu.commands._entry import command
-from pnu.config.instantiate import build
+from pnu.config.instantiate import instantiate
 from pnu.config.quoting import shell_line
 from pnu.config.schema import Group, doc
 
@@ -27,7 +27,7 @@ class Prepare:
 def prepare(cfg: Any) -> None:
     from pnu.data.patch_file import describe
 
-    path = Path(cfg.describe) if cfg.describe else build(cfg.data, "pnu.data").patch_file()
+    path = Path(cfg.describe) if cfg.describe else instantiate(cfg.data, "pnu.data").patch_file()
     if cfg.output and not cfg.describe:
         path = copied(path, Path(cfg.output))
     figures = describe(path)
@@ -43,9 +43,9 @@ def prepare(cfg: Any) -> None:
 def next_line(path: Path) -> str:
     """The training that a file of patches is fit for, or why it is fit for none."""
     from pnu.data.patch_dataset import Options, split
-    from pnu.data.patch_file import check
+    from pnu.data.patch_file import check_patch_file
 
-    contents, usual = check(path), Options()
+    contents, usual = check_patch_file(path), Options()
     target = min(usual.target_points, contents.points)
     points = min(usual.input_points, target // 4)
     if points < 64:

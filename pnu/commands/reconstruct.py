@@ -21,18 +21,18 @@ class Reconstruct:
     input: str = doc(
         "cloud to read: ply, text (xyz, csv, pts ...), pcd, las, laz, e57, npy, npz; of a mesh its vertices"
     )
-    output: str = doc("mesh to write: ply (keeps colours and errors), obj, off or stl")
+    output: str = doc("mesh to write: ply (keeps colors and errors), obj, off or stl")
     normals: str = doc("auto: the file's, estimated where it has none; estimate: always estimated")
     columns: str | None = doc(
         "of text, or an array without names: x,y,z,_,r,g,b (_ is left out); null: by its names or the usual order"
     )
     depth: int | None = doc("of the octree, 8 is usual, one more is twice as fine; null: from the points' spacing")
     trim: float = doc("share of the least supported vertices to cut off, for open surfaces, such as 0.05")
-    truth: str | None = doc("mesh of the true surface: the error of each vertex is measured, stored and coloured")
+    truth: str | None = doc("mesh of the true surface: the error of each vertex is measured, stored and colored")
     report: str | None = doc("json for the summary of the errors; null: the output's name with .json")
     colormap: str = doc("of errors. error: red = zero to blue = high, as the paper; perceptual: dark to light")
     limit: float | None = doc(
-        "error at the end of the colours, in the cloud's unit; null: 98 % of the vertices' are below"
+        "error at the end of the colors, in the cloud's unit; null: 98 % of the vertices' are below"
     )
     timeout: float = doc("seconds that the reconstruction may take")
     seed: int = doc("of the points on the true surface whose distance to the mesh is measured")
@@ -43,18 +43,18 @@ def reconstruct(cfg: Any) -> None:
     import numpy as np
 
     from pnu import io, reconstruction
-    from pnu.geometry.cloud_statistics import survey
+    from pnu.geometry.cloud_statistics import describe_cloud
     from pnu.geometry.mesh_topology import open_edges, vertex_normals
 
     started = time.perf_counter()
     say: Callable[[str], None] = (lambda text: None) if cfg.quiet else print
-    check(cfg)
+    check_options(cfg)
     points, normals, attributes, notes = io.read_cloud(cfg.input, normals=cfg.normals == "auto", columns=cfg.columns)
     origin = "with normals" if normals is not None else "normals estimated and oriented"
     say(f"input:  {cfg.input}, {len(points)} points, {origin}")
     for note in notes:
         say(f"        {note}")
-    for text in survey(points, normals).warnings():
+    for text in describe_cloud(points, normals).warnings():
         warn(text)
     truth = None
     if cfg.truth:
@@ -92,12 +92,12 @@ def reconstruct(cfg: Any) -> None:
     say(f"output: {cfg.output}, {counts}, {time.perf_counter() - started:.1f} s")
     for note in notes:
         say(f"        {note}")
-    for text in survey(points, normals).warnings():
+    for text in describe_cloud(points, normals).warnings():
         warn(text)
     say(f"next:   {shell_line('picture', inputs=[cfg.input, cfg.output], output='picture.png')}")
 
 
-def check(cfg: Any) -> None:
+def check_options(cfg: Any) -> None:
     """Refuse what can be refused before the work begins."""
     from pnu.io import MESH_OUTPUTS, check_writable
     from pnu.rendering.colors import COLORMAPS

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pnu.commands._entry import command
-from pnu.config.instantiate import PACKAGES, build, find_metric
+from pnu.config.instantiate import PACKAGES, find_metric, instantiate
 from pnu.config.schema import Group, Groups, doc
 from pnu.runtime.provenance import machine
 from pnu.training.result_table import closing, job_line, objective
@@ -60,10 +60,10 @@ def train(cfg: Any) -> list[float] | None:
         pl.seed_everything(config["seed"], verbose=False)
         allow = config["allow"]
         parts = {
-            group: build(config[group], PACKAGES[group], allow=allow)
+            group: instantiate(config[group], PACKAGES[group], allow=allow)
             for group in ("data", "loss", "optimizer", "scheduler")
         }
-        model, data = networks.build(config["model"], allow), parts.pop("data")
+        model, data = networks.build_network(config["model"], allow), parts.pop("data")
         if source := config.get("weights"):
             checkpoints.fill(model, checkpoints.load(source, allow).state_dict(), source)
         find = functools.partial(find_metric, allow=allow)
@@ -74,7 +74,7 @@ def train(cfg: Any) -> list[float] | None:
             name: value for name, value in lightning_module.TRAINER_OPTIONS.items() if name not in config["trainer"]
         }
         with lightning_module.misconfigured():
-            trainer = build(
+            trainer = instantiate(
                 config["trainer"],
                 PACKAGES["trainer"],
                 callbacks=callbacks.build_all(config, run),

@@ -66,12 +66,12 @@ def upsample(cfg: Any) -> None:
         say(f"        {note}")
 
     from pnu import weights
-    from pnu.geometry.cloud_statistics import survey
+    from pnu.geometry.cloud_statistics import describe_cloud
     from pnu.networks import checkpoints
     from pnu.networks.checkpoints import NEWEST
     from pnu.upsamplers import whole_clouds
 
-    look = survey(cloud.points, cloud.normals)
+    look = describe_cloud(cloud.points, cloud.normals)
     say(f"        {look}")
     for text in look.warnings():
         say(f"        {text}")

@@ -10,7 +10,7 @@ from pnu.config.instantiate import GIVEN
 from pnu.config.quoting import quoted
 from pnu.config.schema import (
     Groups,
-    check,
+    checked_config,
     class_arguments,
     config_folder,
     fields,
@@ -75,7 +75,7 @@ def checked(overrides: Sequence[str], schema: type, compose: Callable[..., Any],
 
     cfg = compose(list(overrides), True)
     own, _ = fitted(OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"]), cfg.hydra, schema, overrides)
-    return check(own, schema, complete=complete)
+    return checked_config(own, schema, complete=complete)
 
 
 def parse(overrides: list[str]) -> list[Any]:

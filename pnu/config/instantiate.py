@@ -36,7 +36,7 @@ GIVEN = {  # arguments that the program gives, and why a config cannot
 }
 
 
-def build(
+def instantiate(
     config: Mapping[str, Any] | None, within: str | Sequence[str], *, allow: Sequence[str] = (), **more: Any
 ) -> Any:
     """The object of class `config._target_` with the config's other keys and `more` as arguments; None without target.

@@ -177,7 +177,7 @@ def nearest_key(key: str, known: Sequence[str], rare: Container[str] = ()) -> st
 # --- check ---
 
 
-def check(cfg: Any, schema: type, *, complete: bool = True) -> Any:
+def checked_config(cfg: Any, schema: type, *, complete: bool = True) -> Any:
     """A config resolved and filled up: every key known, every value of its type (`1` becomes 1.0 for a float).
 
     Args:

@@ -17,13 +17,13 @@ def mesh_of(solid: Manifold) -> Mesh:
 
 
 def block(x: float, y: float, z: float, at: Sequence[float] = (0, 0, 0)) -> Manifold:
-    """Box of these lengths, centred at a point."""
+    """Box of these lengths, centerd at a point."""
     return Manifold.cube((x, y, z), True).translate(tuple(at))
 
 
 def rod(radius: float, height: float, at: Sequence[float] = (0, 0, 0), top: float | None = None,
         segments: int = SEGMENTS) -> Manifold:  # fmt: skip
-    """Cylinder along z, or a cone with another radius at its top, centred at a point."""
+    """Cylinder along z, or a cone with another radius at its top, centerd at a point."""
     return Manifold.cylinder(height, radius, radius if top is None else top, segments, True).translate(tuple(at))
 
 
@@ -45,7 +45,7 @@ def plate(x: float, y: float, z: float, corner: float) -> Manifold:
 
 
 def polygon(points: ArrayLike, height: float) -> Manifold:
-    """Prism of an outline, centred in z."""
+    """Prism of an outline, centerd in z."""
     return CrossSection([np.asarray(points, float)]).extrude(height).translate((0, 0, -height / 2))
 
 

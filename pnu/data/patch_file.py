@@ -41,7 +41,7 @@ class Patches(NamedTuple):
 
 
 def cut_patches(mesh: Mesh, count: int, rng: np.random.Generator) -> Patches:
-    """Patches of 4096 evenly spread points: centres by farthest points, the nearest points of each by distance, as at
+    """Patches of 4096 evenly spread points: centers by farthest points, the nearest points of each by distance, as at
     inference. Half of them are cut from a dense sampling and cover a small share of the shape, half from a sparse one.
     """
     sharp = sharp_edge_points(mesh, spacing=0.01)

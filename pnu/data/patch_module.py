@@ -114,7 +114,7 @@ class PatchDataModule(EpochDataModule):
         target_points: points of a target patch; fewer than the file has take a smaller patch
         downsampling: nonuniform (paper), random (released, but without replacement), poisson (evenly) or given (file)
         evaluation: downsampling of validation and test; null: the training's
-        strength: nonuniform: centres are exp(strength) times denser than the farthest points; 0: uniform
+        strength: nonuniform: centers are exp(strength) times denser than the farthest points; 0: uniform
         centers: nonuniform: dense places of a patch
         augmentation: random changes of training samples; a part with range or sigma 0 is off; null: none at all
         val_share: share of the shapes kept for validation

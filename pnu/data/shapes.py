@@ -22,7 +22,7 @@ def names(*kinds: str) -> list[str]:
 
 
 def make(name: str) -> Mesh:
-    """The closed mesh of that name, faces outward, centred in its box, greatest distance from the centre 1."""
+    """The closed mesh of that name, faces outward, centerd in its box, greatest distance from the center 1."""
     for shapes in KINDS.values():
         if name in shapes:
             return unit(shapes[name]())
@@ -30,6 +30,6 @@ def make(name: str) -> Mesh:
 
 
 def unit(mesh: Mesh) -> Mesh:
-    """A mesh moved and scaled: the centre of its box is 0 and the greatest distance from it 1."""
+    """A mesh moved and scaled: the center of its box is 0 and the greatest distance from it 1."""
     centered = mesh.vertices - (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     return Mesh(centered / np.linalg.norm(centered, axis=1).max(), mesh.faces)

@@ -65,10 +65,10 @@ class Scratch:
         return self.like.new_empty(self.rows, width)
 
 
-def spread(work: Callable[[list[Chunk]], T], chunks: list[Chunk]) -> list[T]:
+def map_chunks(work: Callable[[list[Chunk]], T], chunks: list[Chunk]) -> list[T]:
     """Call `work` with consecutive parts of the chunks, one part a thread of torch; results in order."""
     number, rows = torch.get_num_threads(), chunks[-1].stop
     parts: list[list[Chunk]] = [[] for _ in range(number)]
     for chunk in chunks:
         parts[(chunk.start + chunk.stop) * number // (2 * rows)].append(chunk)
-    return threads.spread(work, [part for part in parts if part])
+    return threads.map_on_threads(work, [part for part in parts if part])

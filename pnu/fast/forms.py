@@ -1,7 +1,7 @@
 """Fast forms of the parts of `pnu.networks`. Each is a subclass that replaces `forward`.
 
 On the CPU layers run chunk by chunk (`stack`). A first layer, which is linear, multiplies before its input is gathered,
-interpolated or repeated: once a point, not once a neighbour or copy.
+interpolated or repeated: once a point, not once a neighbor or copy.
 """
 
 from collections.abc import Sequence
@@ -91,7 +91,7 @@ class JoinedMLP(layers.JoinedMLP):
 
 
 class Abstraction(layers.Abstraction):
-    """An offset is point minus centre: both are multiplied, with the features, before they are gathered."""
+    """An offset is point minus center: both are multiplied, with the features, before they are gathered."""
 
     def forward(self, points: Tensor, features: Tensor, centers: Tensor) -> Tensor:
         (clouds, n, _), m = points.shape, centers.shape[1]
@@ -119,7 +119,7 @@ class Propagation(layers.Propagation):
 
 
 class EdgeConvolution(pugeo.EdgeConvolution):
-    """Neighbours are multiplied before they are gathered."""
+    """Neighbors are multiplied before they are gathered."""
 
     def forward(self, x: Tensor, neighbors: Tensor) -> Tensor:
         return self.pooled(self.center(x)[:, :, None] + gather(self.neighbor(x), neighbors))

@@ -1,8 +1,8 @@
-"""Neighbourhoods without their repetitions.
+"""Neighborhoods without their repetitions.
 
-A ball query fills up small balls with copies of their first point: of 32 neighbours in a patch of 1024 points often 20
+A ball query fills up small balls with copies of their first point: of 32 neighbors in a patch of 1024 points often 20
 are copies. They change the statistics of batch norm, by their number, but neither the maximum nor its gradient.
-`Groups` keeps each neighbour once, with its multiplicity.
+`Groups` keeps each neighbor once, with its multiplicity.
 """
 
 from typing import NamedTuple
@@ -12,15 +12,15 @@ from torch import Tensor
 
 
 class Groups(NamedTuple):
-    """Rows, one a neighbour, in groups, one a neighbourhood; groups of equal size stand together.
+    """Rows, one a neighbor, in groups, one a neighborhood; groups of equal size stand together.
 
-    Neighbourhoods and points are counted through the batch: neighbourhood i of cloud b is b m + i.
+    Neighborhoods and points are counted through the batch: neighborhood i of cloud b is b m + i.
     """
 
     source: Tensor  # (R,): row r is point source[r]
-    owner: Tensor  # (R,): row r belongs to neighbourhood owner[r]
+    owner: Tensor  # (R,): row r belongs to neighborhood owner[r]
     multiplicity: Tensor | None  # (R,) float: how often row r counts; None: every row once
-    order: Tensor | None  # (G,): group g is neighbourhood order[g]; None: they stand in order
+    order: Tensor | None  # (G,): group g is neighborhood order[g]; None: they stand in order
     runs: list[tuple[int, int]]  # (number, size) of groups of equal size, in the order of rows
 
     @property
@@ -30,7 +30,7 @@ class Groups(NamedTuple):
 
 
 def single(neighbors: Tensor, n: int) -> Groups:
-    """Groups of neighbors (B, m, k) in clouds of n points: every neighbour one row, in order."""
+    """Groups of neighbors (B, m, k) in clouds of n points: every neighbor one row, in order."""
     clouds, m, k = neighbors.shape
     source = (neighbors + torch.arange(clouds, device=neighbors.device).view(-1, 1, 1) * n).flatten()
     owner = torch.arange(clouds * m, device=neighbors.device).repeat_interleave(k)
@@ -38,7 +38,7 @@ def single(neighbors: Tensor, n: int) -> Groups:
 
 
 def distinct(neighbors: Tensor, n: int) -> Groups:
-    """Groups of neighbors (B, m, k) in clouds of n points; copies of a neighbourhood's first are counted, not kept."""
+    """Groups of neighbors (B, m, k) in clouds of n points; copies of a neighborhood's first are counted, not kept."""
     clouds, m, k = neighbors.shape
     flat = (neighbors + torch.arange(clouds).view(-1, 1, 1) * n).view(clouds * m, k)
     kept = flat != flat[:, :1]
@@ -64,7 +64,7 @@ def whole(clouds: int, n: int) -> Groups:
 
 
 def pool(rows: Tensor, groups: Groups) -> Tensor:
-    """Maximum of the rows (R, C) of each neighbourhood: (G, C), in the order of neighbourhoods."""
+    """Maximum of the rows (R, C) of each neighborhood: (G, C), in the order of neighborhoods."""
     parts, start = [], 0
     for number, size in groups.runs:
         stop = start + number * size
@@ -74,5 +74,5 @@ def pool(rows: Tensor, groups: Groups) -> Tensor:
 
 
 def ungroup(pooled: Tensor, groups: Groups) -> Tensor:
-    """Values (G, C) of groups in the order of neighbourhoods."""
+    """Values (G, C) of groups in the order of neighborhoods."""
     return pooled if groups.order is None else torch.empty_like(pooled).index_copy(0, groups.order, pooled)

@@ -26,7 +26,7 @@ import torch.distributed
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pnu.fast.cache import Chunk, Scratch, group_chunks, row_chunks, spread
+from pnu.fast.cache import Chunk, Scratch, group_chunks, map_chunks, row_chunks
 from pnu.fast.combine import scatter
 from pnu.fast.groups import Groups, ungroup
 from pnu.networks.layers import Layer
@@ -45,7 +45,7 @@ def train(
 ) -> Tensor:
     """Layers in training mode on CPU rows x (R, C): (R, C'), or their maximum over groups, (G, C').
 
-    With `projected`, x already holds the products of the first layer. With `centers` (neighbourhoods, C) too, x is a
+    With `projected`, x already holds the products of the first layer. With `centers` (neighborhoods, C) too, x is a
     table (points, C), and row r the difference x[groups.source[r]] - centers[groups.owner[r]].
     """
     falling = layers[0].norm.weight.detach() < 0
@@ -181,7 +181,7 @@ class _Stack(torch.autograd.Function):
             for chunk in part:
                 norms[-1].activate(source.rows.chunk(chunk, out), out[chunk.rows])
 
-        spread(activate, row_chunks(*out.shape))
+        map_chunks(activate, row_chunks(*out.shape))
         return out
 
     @staticmethod
@@ -266,7 +266,7 @@ def _multiply(
             torch.mv(shifted.t(), counts, out=alone)
             torch.mv(torch.square(shifted, out=free).t(), counts, out=squares)
 
-    spread(work, chunks)
+    map_chunks(work, chunks)
     count = torch.tensor(float(rows), dtype=torch.float64) if often is None else often.double().sum()
     alone, squares = sums.double().sum(0)
     return products, pooled, Moments(count, alone, squares, constant.double(), across is not None)
@@ -296,7 +296,7 @@ def _statistics(layer: Layer, weight: Tensor | None, below: Norm | None, moments
 
 
 def _everywhere(norm: BatchNorm, *sums: Tensor) -> list[Tensor]:
-    """Sums over all processes, where batch norm is to be synchronised."""
+    """Sums over all processes, where batch norm is to be synchronized."""
     total = torch.stack(sums)
     return list(everywhere(total) if norm.synchronized and torch.distributed.is_initialized() else total)
 
@@ -380,7 +380,7 @@ def _pull_back(
                     torch.mv(free.t(), scratch.ones[:number], out=with_deviation)
         return total
 
-    parts = spread(work, chunks)
+    parts = map_chunks(work, chunks)
     d_weight = None if weight is None else torch.stack(parts).sum(0)  # type: ignore[arg-type]
     total = sums.sum(0)
     if below is not None and weight is not None and d_weight is not None and not far:
@@ -406,7 +406,7 @@ def _rectify_all(rows: Rows | Differences, norm: Norm, gradient: Tensor) -> tupl
             torch.mv(out.t(), scratch.ones[:number], out=alone)
             torch.mv(torch.sub(products, norm.mean, out=free).mul_(out).t(), scratch.ones[:number], out=with_deviation)
 
-    spread(work, chunks)
+    map_chunks(work, chunks)
     return kept, sums.sum(0)
 
 
@@ -418,7 +418,7 @@ def _sums_of_groups(rows: Tensor, groups: Groups) -> Tensor:
         for chunk in part:
             torch.sum(chunk.grouped(rows[chunk.rows]), 1, out=result[chunk.groups])
 
-    spread(work, group_chunks(groups, rows.shape[1]))
+    map_chunks(work, group_chunks(groups, rows.shape[1]))
     return result
 
 
@@ -454,7 +454,7 @@ def infer(
             else:
                 torch.amax(chunk.grouped(h), 1, out=result[chunk.groups])
 
-    spread(work, chunks)
+    map_chunks(work, chunks)
     return result if groups is None else ungroup(result, groups)
 
 

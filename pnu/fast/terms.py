@@ -1,4 +1,4 @@
-"""The three neighbourhood terms of the loss at once: value and gradient in one pass over pieces in the cache. CPU only.
+"""The three neighborhood terms of the loss at once: value and gradient in one pass over pieces in the cache. CPU only.
 
 Saves about 5 % of a training step.
 """
@@ -10,9 +10,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pnu.losses import compound
-from pnu.runtime.threads import spread
+from pnu.runtime.threads import map_on_threads
 
-PIECE = 1024  # points whose neighbours are handled at once
+PIECE = 1024  # points whose neighbors are handled at once
 
 
 class CompoundLoss(compound.CompoundLoss):
@@ -25,7 +25,7 @@ class CompoundLoss(compound.CompoundLoss):
 
 
 def sums(prediction: Tensor, neighbors: Tensor, absolute: bool, tiny: float) -> Tensor:
-    """Sums over points, neighbours and clouds of `compound.point_knn`, `normal_orth` and `normal_knn`: (3,).
+    """Sums over points, neighbors and clouds of `compound.point_knn`, `normal_orth` and `normal_knn`: (3,).
 
     prediction (B, m, 6), neighbors (B, m, k) int64; `tiny`: squared length below which a direction counts as none.
     """
@@ -45,7 +45,7 @@ class _Sums(torch.autograd.Function):
             gradient = None if gradients is None else gradients[cloud]
             return _cloud(columns[cloud], neighbors[cloud], absolute, tiny, gradient)
 
-        total = torch.stack(spread(work, range(len(columns)))).sum(0)
+        total = torch.stack(map_on_threads(work, range(len(columns)))).sum(0)
         ctx.save_for_backward(gradients)
         return total.to(prediction.dtype)
 
@@ -62,7 +62,7 @@ class _Sums(torch.autograd.Function):
 def _cloud(columns: Tensor, neighbors: Tensor, absolute: bool, tiny: float, gradient: Tensor | None) -> Tensor:
     """Sums (3,) float64 of one cloud (6, m); fills its gradient (12, m)."""
     total = torch.zeros(3, dtype=torch.float64)
-    others = torch.zeros_like(columns[:1].expand(9, -1))  # what reaches the neighbours
+    others = torch.zeros_like(columns[:1].expand(9, -1))  # what reaches the neighbors
     for start in range(0, columns.shape[1], PIECE):
         idx = neighbors[start : start + PIECE]
         own = columns[:, start : start + PIECE, None]

@@ -6,7 +6,7 @@ from torch.nn.functional import normalize
 
 from pnu.geometry.neighbor_search import knn
 
-CHUNK_NEIGHBOURS = 2**20  # neighbours held at once: about 100 MB
+CHUNK_NEIGHBORS = 2**20  # neighbors held at once: about 100 MB
 
 
 def apss_project(points: Tensor, cloud: Tensor, k: int = 10, *, steps: int = 4) -> Tensor:
@@ -23,10 +23,10 @@ def apss_project(points: Tensor, cloud: Tensor, k: int = 10, *, steps: int = 4) 
     if cloud.ndim != 2 or cloud.shape[1] != 6:
         raise ValueError(f"cloud: expected points and normals (n, 6), found {tuple(cloud.shape)}")
     if not 4 <= k <= len(cloud):
-        raise ValueError(f"k: expected 4 to {len(cloud)} neighbours (the points of the cloud), found {k}")
+        raise ValueError(f"k: expected 4 to {len(cloud)} neighbors (the points of the cloud), found {k}")
     source = cloud.double()
     result = points.new_empty(len(points), 6)
-    chunk = max(1, CHUNK_NEIGHBOURS // k)
+    chunk = max(1, CHUNK_NEIGHBORS // k)
     for start in range(0, len(points), chunk):
         part = slice(start, start + chunk)
         x = points[part].double()
@@ -34,15 +34,15 @@ def apss_project(points: Tensor, cloud: Tensor, k: int = 10, *, steps: int = 4) 
         for _ in range(steps):
             found = knn(x[None], source[None, :, :3], k)
             near = source[found.idx[0]]
-            sphere = fit_sphere(near[..., :3] - x[:, None], near[..., 3:], neighbour_weights(found.dist_sq[0]))
+            sphere = fit_sphere(near[..., :3] - x[:, None], near[..., 3:], neighbor_weights(found.dist_sq[0]))
             move, normal = project_to_sphere(*sphere)
             x = x + move
         result[part] = torch.cat([x, normal], dim=1).to(result)
     return result
 
 
-def neighbour_weights(dist_sq: Tensor) -> Tensor:
-    """Weights (1 - (d/h)^2)^4 of neighbours at ascending squared distances (..., k), with h^2 = 1.1 x the last."""
+def neighbor_weights(dist_sq: Tensor) -> Tensor:
+    """Weights (1 - (d/h)^2)^4 of neighbors at ascending squared distances (..., k), with h^2 = 1.1 x the last."""
     h_sq = 1.1 * dist_sq[..., -1:].clamp(min=torch.finfo(dist_sq.dtype).tiny)
     return (1 - dist_sq / h_sq).pow(4)
 
@@ -50,7 +50,7 @@ def neighbour_weights(dist_sq: Tensor) -> Tensor:
 def fit_sphere(points: Tensor, normals: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Algebraic sphere u0 + u.x + uq |x|^2 = 0 whose gradient fits the normals best: u0 (...), u (..., 3), uq (...).
 
-    points, normals (..., k, 3), weights (..., k) not all zero. u and uq minimise the weighted sum of
+    points, normals (..., k, 3), weights (..., k) not all zero. u and uq minimize the weighted sum of
     |u + 2 uq p - n|^2, then u0 makes the weighted mean of the field at the points zero: the closed form of
     Guennebaud, Germann and Gross 2008. A plane (uq = 0) where the points have no extent.
     """

@@ -1,10 +1,10 @@
-"""Colours and other attributes of a cloud, carried over to points between its own."""
+"""Colors and other attributes of a cloud, carried over to points between its own."""
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-NEIGHBOURS = 6
-SAME_SIDE = 0.2  # cosine between normals below which a neighbour counts as another sheet's
+NEIGHBORS = 6
+SAME_SIDE = 0.2  # cosine between normals below which a neighbor counts as another sheet's
 
 
 def carry(dense: np.ndarray, sparse: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -14,14 +14,14 @@ def carry(dense: np.ndarray, sparse: np.ndarray, values: np.ndarray) -> np.ndarr
     Mean of the nearest 6 with weights 1 / d^2 times the cosine between the normals, of those that face the same way;
     where none does, the nearest. Whole numbers are rounded, other types (text, truth values) taken from the nearest.
     """
-    k = min(2 * NEIGHBOURS, len(sparse))
+    k = min(2 * NEIGHBORS, len(sparse))
     dist, idx = cKDTree(sparse[:, :3]).query(dense[:, :3], k=np.arange(1, k + 1))
     cosine = (dense[:, None, 3:] * sparse[idx, 3:6]).sum(-1)
     alike = cosine > SAME_SIDE
     nearest = idx[np.arange(len(dense)), alike.argmax(1)]  # the first of all where none is alike
     if not (np.issubdtype(values.dtype, np.number) and not np.issubdtype(values.dtype, np.complexfloating)):
         return values[nearest]
-    alike &= alike.cumsum(1) <= NEIGHBOURS
+    alike &= alike.cumsum(1) <= NEIGHBORS
     floor = 1e-12 * max(float(np.square(dist[:, -1]).mean()), np.finfo(float).tiny)
     weight = np.where(alike, cosine, 0) / (dist**2 + floor)
     lost = ~alike.any(1)

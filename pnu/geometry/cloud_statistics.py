@@ -9,17 +9,17 @@ from scipy.spatial import cKDTree
 
 from pnu.geometry.noise_level import noise_level
 
-NEIGHBOURS = 8
+NEIGHBORS = 8
 PLACES = 4000
 CONTRADICTING = (
     0.06  # share of pairs; 0.03 on clean shapes of 300 points, 0.06 on thin ones with noise, 2 f (1 - f) for f flipped
 )
-FAR = 1.0  # radii of the middle 99 % of the points: one that far from its fourth neighbour stands alone
+FAR = 1.0  # radii of the middle 99 % of the points: one that far from its fourth neighbor stands alone
 UNEVEN = 2.0  # random points of an even density stay below
 FAINT = 0.05  # noise in spacings that does not stand out from curvature
 
 
-class Survey(NamedTuple):
+class CloudStatistics(NamedTuple):
     """Lengths in the unit of the cloud."""
 
     dense: float  # spacing where a tenth of the points lie closer: what as many points have if evenly spread
@@ -27,7 +27,7 @@ class Survey(NamedTuple):
     sparse: float  # where a tenth of them lie farther apart
     noise: float  # standard deviation across the surface, an upper bound
     radius: float  # largest distance from the middle of the box
-    contradicting: float  # share of neighbouring pairs whose normals look against each other
+    contradicting: float  # share of neighboring pairs whose normals look against each other
     far: int  # points that lie farther from all others than those are from each other
     farthest: int  # row of the one that lies farthest
 
@@ -46,7 +46,7 @@ class Survey(NamedTuple):
         found = []
         if self.contradicting > CONTRADICTING:
             found.append(
-                f"{self.contradicting:.0%} of neighbouring normals contradict each other; normals=estimate makes others"
+                f"{self.contradicting:.0%} of neighboring normals contradict each other; normals=estimate makes others"
             )
         if self.far:
             found.append(
@@ -56,9 +56,9 @@ class Survey(NamedTuple):
         return found
 
 
-def survey(points: NDArray, normals: NDArray | None = None) -> Survey:
+def describe_cloud(points: NDArray, normals: NDArray | None = None) -> CloudStatistics:
     """Spacing and noise of a cloud (n, 3), n >= 16; normals (n, 3) tell the sides of thin walls apart."""
-    k = min(NEIGHBOURS, len(points) - 1)
+    k = min(NEIGHBORS, len(points) - 1)
     far = cKDTree(points).query(points[:: -(-len(points) // PLACES)], k=[k + 1])[0]
     dense, middle, sparse = (float(value) for value in np.quantile(far * np.sqrt(np.pi / k), (0.1, 0.5, 0.9)))
     units = None if normals is None else normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
@@ -66,11 +66,11 @@ def survey(points: NDArray, normals: NDArray | None = None) -> Survey:
     center = (points.min(0) + points.max(0)) / 2
     radius = float(np.linalg.norm(points - center, axis=1).max())
     against = 0.0 if units is None else contradicting(points, units)
-    return Survey(dense, middle, sparse, noise, radius, against, *far_points(points))
+    return CloudStatistics(dense, middle, sparse, noise, radius, against, *far_points(points))
 
 
 def contradicting(points: NDArray, normals: NDArray) -> float:
-    """Share of pairs of neighbours (at most 4000 places, 6 each) whose unit normals (n, 3) contradict each other.
+    """Share of pairs of neighbors (at most 4000 places, 6 each) whose unit normals (n, 3) contradict each other.
 
     Normals of a pair contradict where they differ by more than 120 degrees though the pair lies along the surface of
     both. Two sides of a thin wall do so too, but there normals look away from each other, where wrong signs look
@@ -90,7 +90,7 @@ def contradicting(points: NDArray, normals: NDArray) -> float:
 
 
 def far_points(points: NDArray) -> tuple[int, int]:
-    """How many points lie farther from their fourth neighbour than 99 % of them reach, and the row of the farthest."""
+    """How many points lie farther from their fourth neighbor than 99 % of them reach, and the row of the farthest."""
     distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     reach = float(np.quantile(distance, 0.99))
     rows = np.flatnonzero(distance > (1 + FAR) * reach)

@@ -12,15 +12,15 @@ from pnu.geometry.spatial_blocks import along_curve
 from pnu.runtime.progress import Step, silent
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
-ROWS = 2**18  # points whose neighbours are gathered at once: bounds the memory
-RANK = 12  # of the neighbour that a disc of seeds reaches
+ROWS = 2**18  # points whose neighbors are gathered at once: bounds the memory
+RANK = 12  # of the neighbor that a disc of seeds reaches
 
 
 def tangent_discs(points: Tensor, normals: Tensor, count: int, *, rank: int = RANK, first: int | None = None) -> Tensor:
-    """Seeds on a disc around each point in its tangent plane, as wide as the rank-th neighbour is far.
+    """Seeds on a disc around each point in its tangent plane, as wide as the rank-th neighbor is far.
 
     points, normals (n, 3) -> (n, count, 3), or (first, count, 3) around the first points alone. Evenly spread by area
-    (a sunflower), turned from point to point and measured from the direction of the nearest neighbour: nothing is
+    (a sunflower), turned from point to point and measured from the direction of the nearest neighbor: nothing is
     random, and seeds turn and grow with the cloud. The discs overlap, so that seeds also lie in holes between points.
     """
     rank = min(rank, len(points) - 1)
@@ -48,13 +48,13 @@ def tangent_discs(points: Tensor, normals: Tensor, count: int, *, rank: int = RA
     return discs
 
 
-def repel(points: Tensor, normals: Tensor, *, steps: int, neighbours: int = 8, step: Step = silent) -> Tensor:
-    """Even out the spacing: points (m, 3) push neighbours apart in their tangent planes, `steps` times.
+def repel(points: Tensor, normals: Tensor, *, steps: int, neighbors: int = 8, step: Step = silent) -> Tensor:
+    """Even out the spacing: points (m, 3) push neighbors apart in their tangent planes, `steps` times.
 
     Points push each other with a force that falls to zero at about the distance that evenly spread points have, so
     a cloud does not grow beyond its border. Points of sheets that look opposite ways ignore each other.
     """
-    m, k = len(points), min(neighbours + 1, len(points))
+    m, k = len(points), min(neighbors + 1, len(points))
     parts = torch.arange(m, device=points.device).split(ROWS)
     dist, idx = points.new_empty(m, k - 1), torch.empty(m, k - 1, dtype=torch.int32, device=points.device)
     done, total = 0, steps * len(parts)

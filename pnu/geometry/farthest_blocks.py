@@ -1,9 +1,9 @@
 """Farthest points of a large cloud block by block, without borders between the blocks.
 
 Farthest points are a packing: those chosen last are about as far from the others all over the cloud. So blocks agree on
-that distance first. Then each block takes farthest points down to it, beginning with what its neighbours have taken
-already: nothing closer than the distance to a neighbour's point is a candidate any more, and all these points count in
-the order of choice. Blocks that are no neighbours work at the same time; the result does not depend on it.
+that distance first. Then each block takes farthest points down to it, beginning with what its neighbors have taken
+already: nothing closer than the distance to a neighbor's point is a candidate any more, and all these points count in
+the order of choice. Blocks that are no neighbors work at the same time; the result does not depend on it.
 """
 
 import math
@@ -23,7 +23,7 @@ BLOCK = 2**16  # points
 SURPLUS = 1.006  # points to choose, of those wanted: the last ones are dropped for an exact count
 CLOSE = 1.01  # a greater surplus is worth another try,
 TRIES = 3  # of so many
-MARGIN = 4  # distances around a block within which it sees its neighbours
+MARGIN = 4  # distances around a block within which it sees its neighbors
 PROBES = 48  # chosen points whose distance to those chosen before is looked up
 
 Choose = Callable[[NDArray[np.float32], int], Index]
@@ -140,7 +140,7 @@ def _choose_all(
         order = order[: round(decline.before(reach))]
         mine = np.flatnonzero((order >= len(fixed)) & np.isin(both[order], own, assume_unique=True))
         idx = both[order[mine]]
-        # near a border the distance may be one to a point that the neighbour will not choose: such points are kept
+        # near a border the distance may be one to a point that the neighbor will not choose: such points are kept
         seen = np.zeros(len(idx), bool)
         for other in blocks.near(number, margin):
             seen |= blocks.inside(xyz[idx], other, 2 * reach)
@@ -154,7 +154,7 @@ def _choose_all(
             tick()
 
     def fill(number: int) -> tuple[Index, NDArray[np.float64]]:
-        """Holes at the borders, where a block relied on points of a neighbour's that were not chosen in the end."""
+        """Holes at the borders, where a block relied on points of a neighbor's that were not chosen in the end."""
         own, near = blocks.members[number], blocks.near(number, margin)
         edge = np.zeros(len(own), bool)
         for other in near:

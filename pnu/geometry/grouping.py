@@ -1,4 +1,4 @@
-"""Collect features at neighbours."""
+"""Collect features at neighbors."""
 
 import torch
 from torch import Tensor
@@ -24,7 +24,7 @@ def interpolate(features: Tensor, points: Tensor, query: Tensor, k: int = 3) -> 
     """Mean of the features of the k nearest points, weighted by inverse distance (feature propagation of PointNet++).
 
     features (B, n, C) at points (B, n, 3), wanted at query (B, m, 3) -> (B, m, C). Weights 1 / (d + 1e-8), d the plain
-    distance, normalised to sum 1. Fewer than k points: all of them. Differentiable with respect to the features only.
+    distance, normalized to sum 1. Fewer than k points: all of them. Differentiable with respect to the features only.
     """
     dist_sq, idx = knn(query, points, min(k, points.shape[1]))
     weight = 1 / (dist_sq.sqrt() + 1e-8)

@@ -6,29 +6,29 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pnu.geometry.algebraic_sphere import fit_sphere, neighbour_weights, project_to_sphere
+from pnu.geometry.algebraic_sphere import fit_sphere, neighbor_weights, project_to_sphere
 
-FEATURES = 11  # numbers that describe a neighbour
+FEATURES = 11  # numbers that describe a neighbor
 REACH = 1.5  # longest step to the fitted sphere, in units of the spacing
 FLAT = 0.03  # weight of positions beside normals in the choice of the first axis
 
 
 class LocalFrames(NamedTuple):
-    """Frames of m queries and their k neighbours in them."""
+    """Frames of m queries and their k neighbors in them."""
 
-    base: Tensor  # (m, 3) foot of the query on the sphere that fits its neighbours, relative to the query
+    base: Tensor  # (m, 3) foot of the query on the sphere that fits its neighbors, relative to the query
     axes: Tensor  # (m, 3, 3) rows x, y and z; z is the sphere's normal; orthonormal, of either hand
-    spacing: Tensor  # (m, 1) mean distance of the neighbours, the unit of length
+    spacing: Tensor  # (m, 1) mean distance of the neighbors, the unit of length
     height: Tensor  # (m, 1) of the query above the foot, in spacings
     features: Tensor  # (m, k, 11): position 0:3, normal 3:6, then lengths and products of them
 
 
 def local_frames(offsets: Tensor, normals: Tensor, hint: Tensor, *, sphere: bool = True) -> LocalFrames:
-    """Frames for queries by offsets and normals (m, k, 3) of their neighbours, nearest first, and a rough normal.
+    """Frames for queries by offsets and normals (m, k, 3) of their neighbors, nearest first, and a rough normal.
 
-    One step of an algebraic point set surface (`pnu.geometry.algebraic_sphere`) gives foot and normal; neighbours that
+    One step of an algebraic point set surface (`pnu.geometry.algebraic_sphere`) gives foot and normal; neighbors that
     look away from the rough normal count little. The first axis is where normals change most, across an edge say, or
-    where the neighbours spread most on a plane; the signs of both axes come from the third moment of the positions. So
+    where the neighbors spread most on a plane; the signs of both axes come from the third moment of the positions. So
     frames turn, move and grow with the cloud. Without `sphere` the foot is the query and its normal the rough one.
     """
     spacing, seen, weights = _surroundings(offsets, normals, hint)
@@ -37,7 +37,7 @@ def local_frames(offsets: Tensor, normals: Tensor, hint: Tensor, *, sphere: bool
     x = x - step[:, None]
     axes = torch.stack([*_tangents(x, normals, z, weights), z], 1)
     local, local_normals = x @ axes.mT, normals @ axes.mT
-    height = (local * local_normals).sum(-1, keepdim=True)  # of the foot below the neighbour's plane
+    height = (local * local_normals).sum(-1, keepdim=True)  # of the foot below the neighbor's plane
     bent = 0.5 * (height + local[..., 2:])  # the same if the surface bends evenly: exact on a sphere
     share = weights[..., None] * weights.shape[1]
     length = local.norm(dim=-1, keepdim=True)
@@ -53,16 +53,16 @@ def feet(offsets: Tensor, normals: Tensor, hint: Tensor) -> tuple[Tensor, Tensor
 
 
 def _surroundings(offsets: Tensor, normals: Tensor, hint: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean distance of the neighbours (m, 1), cosine of their normals and the rough one, their weights (m, k)."""
+    """Mean distance of the neighbors (m, 1), cosine of their normals and the rough one, their weights (m, k)."""
     dist = offsets.norm(dim=-1)
     spacing = dist.mean(1, keepdim=True).clamp(min=torch.finfo(dist.dtype).tiny)
     seen = (normals @ hint[..., None])[..., 0]
-    weights = neighbour_weights((dist / spacing).square()) * ((1 + seen).clamp(min=2e-3) / 2).square()
+    weights = neighbor_weights((dist / spacing).square()) * ((1 + seen).clamp(min=2e-3) / 2).square()
     return spacing, seen, weights / weights.sum(1, keepdim=True).clamp(min=torch.finfo(dist.dtype).tiny)
 
 
 def _foot(x: Tensor, normals: Tensor, hint: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Step in spacings onto the sphere that fits neighbours x (m, k, 3), and the normal there."""
+    """Step in spacings onto the sphere that fits neighbors x (m, k, 3), and the normal there."""
     step, z = project_to_sphere(*fit_sphere(x, normals, weights))
     step = step * (REACH / step.norm(dim=-1, keepdim=True).clamp(min=REACH))
     return step, torch.where(z.norm(dim=-1, keepdim=True) > 0.5, z, hint)

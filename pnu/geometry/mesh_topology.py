@@ -65,7 +65,7 @@ def split_creases(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64],
 def open_edges(mesh: Mesh) -> int:
     """Edges that not as many faces run along in one direction as in the other; 0 for a watertight mesh.
 
-    So holes count, and faces that turn the other way than their neighbours. Vertices at the same place are one.
+    So holes count, and faces that turn the other way than their neighbors. Vertices at the same place are one.
     """
     _, same = np.unique(mesh.vertices, axis=0, return_inverse=True)
     faces = same.reshape(-1)[mesh.faces]

@@ -1,4 +1,4 @@
-"""Neighbour searches between two clouds: trees on the CPU, kernels on a GPU, chunks of bounded memory elsewhere."""
+"""Neighbor searches between two clouds: trees on the CPU, kernels on a GPU, chunks of bounded memory elsewhere."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 CHUNK_ELEMENTS = 2**25  # distances held at once where neither tree nor kernel is used: 128 MiB in float32
-KERNEL_K = 64  # more neighbours than this do not fit a kernel's registers
+KERNEL_K = 64  # more neighbors than this do not fit a kernel's registers
 
 
 class Neighbors(NamedTuple):
@@ -76,7 +76,7 @@ def ball_query(query: Tensor, target: Tensor, radius: float, k: int) -> Tensor:
     """
     _check(query, target)
     if k < 1:
-        raise ValueError(f"k: expected at least 1 neighbour, found {k}")
+        raise ValueError(f"k: expected at least 1 neighbor, found {k}")
     if not radius > 0:
         raise ValueError(f"radius: expected a positive distance, found {radius}")
     query, target = query.detach(), target.detach()
@@ -112,7 +112,7 @@ def gpu_kernels(points: Tensor) -> ModuleType | None:
 
 def _check_k(k: int, n: int) -> None:
     if not 1 <= k <= n:
-        raise ValueError(f"k: expected 1 to {n} neighbours (the number of target points), found {k}")
+        raise ValueError(f"k: expected 1 to {n} neighbors (the number of target points), found {k}")
 
 
 def _check(query: Tensor, target: Tensor) -> None:

@@ -10,14 +10,14 @@ from pnu.geometry.sampling import farthest_points_large
 
 PLACES = 1000
 QUIET = 0.1  # the quietest tenth of the places: elsewhere edges and second sheets look like noise
-# neighbours, and the noise in spacings up to which they tell it apart from the spread of the points themselves
+# neighbors, and the noise in spacings up to which they tell it apart from the spread of the points themselves
 WINDOWS = ((16, 0.22), (24, 0.4), (48, torch.inf))
 
 
 def noise_level(points: Tensor, normals: Tensor | None = None) -> float:
     """Standard deviation of the points (n, 3) across the surface, in their unit of length.
 
-    Residual of quadratic fits to small neighbourhoods, at the quietest tenth of a thousand places. Good to about a
+    Residual of quadratic fits to small neighborhoods, at the quietest tenth of a thousand places. Good to about a
     quarter from 0.1 to 0.8 spacings; below, it is an upper bound: curvature that the points do not resolve counts as
     noise, and so do walls that are thin beside the spacing, unless `normals` (n, 3) tell their sides apart (NaN: not
     known). 0 where there are too few points to tell: fewer than 16, or hardly ten of like side around most places.

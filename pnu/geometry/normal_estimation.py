@@ -14,11 +14,11 @@ def estimate_normals(points: Tensor, k: int = 16, *, orient: bool = True) -> Ten
     """Unit normals of clouds (B, n, 3) -> (B, n, 3).
 
     Without `orient`: least squares plane of the k nearest points (PCA), sign arbitrary. With it: outward on closed
-    shapes, one side on open ones (`orient_normals`), then fitted again to the neighbours on the same sheet only, which
+    shapes, one side on open ones (`orient_normals`), then fitted again to the neighbors on the same sheet only, which
     halves the error at edges and thin walls. ValueError if k is not in 3..n.
     """
     if not 3 <= k <= points.shape[1]:
-        raise ValueError(f"k: expected 3 to {points.shape[1]} neighbours (the number of points), found {k}")
+        raise ValueError(f"k: expected 3 to {points.shape[1]} neighbors (the number of points), found {k}")
     points = points.detach()
     planes = [_plane_normals(xyz, near) for xyz, near in zip(points, knn(points, points, k).idx, strict=True)]
     if orient:
@@ -88,7 +88,7 @@ def _refined(cloud: Cloud, lines: Tensor, *, oriented: bool = False) -> Tensor:
 
 
 def _sheet_normals(cloud: Cloud, normals: Tensor, noise: float) -> Tensor:
-    """Plane fits to the neighbours that face the same way and lie near the tangent plane, signs kept."""
+    """Plane fits to the neighbors that face the same way and lie near the tangent plane, signs kept."""
     k = round(32 * min(1 + 3 * noise, 1.5))
     fitted = []
     for rows in torch.arange(len(normals), device=normals.device).split(ROWS):

@@ -33,7 +33,7 @@ class Cloud(NamedTuple):
 
     points: Tensor  # (n, 3) float32
     idx: Tensor  # (n, k) nearest points, itself first
-    spacing: Tensor  # (n,) usual distance to a neighbour
+    spacing: Tensor  # (n,) usual distance to a neighbor
     area: Tensor  # (n,) of the surface that the point stands for
 
     @staticmethod
@@ -154,7 +154,7 @@ def _least_squares(matrix: Tensor, target: Tensor, steps: int) -> Tensor:
 
 
 def _graph(cloud: Cloud, lines: Tensor) -> csr_matrix:
-    """Neighbours, both ways, by how much their lines turn and how far they leave each other's tangent plane."""
+    """Neighbors, both ways, by how much their lines turn and how far they leave each other's tangent plane."""
     n, near = len(lines), cloud.idx[:, 1:13]
     cosine = (lines[:, None] * lines[near]).sum(-1)
     offset = cloud.points[near] - cloud.points[:, None]
@@ -187,7 +187,7 @@ def _spread(cloud: Cloud, lines: Tensor, anchors: Tensor, sign: Tensor) -> Tenso
 
 
 def field(cloud: Cloud, normals: Tensor, noise: float) -> Tensor:
-    """Minus the gradient of the neighbours' winding number at each point, as unit vectors (n, 3)."""
+    """Minus the gradient of the neighbors' winding number at each point, as unit vectors (n, 3)."""
     width = 1 + 3 * noise
     out = []
     for rows in torch.arange(len(normals), device=normals.device).split(ROWS):

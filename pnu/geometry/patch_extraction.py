@@ -9,7 +9,7 @@ from pnu.runtime.progress import Step, silent
 
 
 def extract(cloud: Tensor, count: int, size: int, *, cover: bool = False) -> Tensor:
-    """Patches of a cloud: centres by farthest point sampling, the `size` nearest points of each, by distance.
+    """Patches of a cloud: centers by farthest point sampling, the `size` nearest points of each, by distance.
 
     cloud (n, 3) or (n, 6) -> idx (count, size) int64. With `cover`, patches are added around points that lie in none
     until every point lies in one, so there may be more than `count`. ValueError if count or size is not in 1..n.

@@ -82,11 +82,11 @@ def random_points(points: Tensor, m: int, *, generator: torch.Generator) -> Tens
 
 
 def nonuniform_points(points: Tensor, m: int, *, strength: float, centers: int, generator: torch.Generator) -> Tensor:
-    """Draw without replacement, dense around random centres and ever thinner away from them.
+    """Draw without replacement, dense around random centers and ever thinner away from them.
 
     points (B, n, 3) -> idx (B, m) int64 in the order of the draws. `centers` of a cloud's own points are chosen at
     random; a point's weight is exp(-strength d), where d is the distance to the nearest of them as a fraction of the
-    greatest such distance: `strength` is the logarithm of how much denser the centres are, 0 a uniform draw.
+    greatest such distance: `strength` is the logarithm of how much denser the centers are, 0 a uniform draw.
     Successive weighted draws are the m largest of log weight + Gumbel noise (Efraimidis and Spirakis 2006).
     ValueError if m or centers is not in 1..n, or strength is negative.
     """
@@ -95,7 +95,7 @@ def nonuniform_points(points: Tensor, m: int, *, strength: float, centers: int, 
     if not strength >= 0:
         raise ValueError(f"strength: expected a number >= 0, found {strength}")
     if not 1 <= centers <= n:
-        raise ValueError(f"centers: expected 1 to {n} centres, found {centers}")
+        raise ValueError(f"centers: expected 1 to {n} centers, found {centers}")
     chosen = random_points(points, centers, generator=generator)
     distance = nearest(points, points.gather(1, chosen[..., None].expand(-1, -1, 3))).dist_sq.sqrt()
     fraction = distance / distance.amax(1, keepdim=True).clamp_min(torch.finfo(distance.dtype).tiny)

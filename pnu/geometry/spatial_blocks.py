@@ -1,4 +1,4 @@
-"""Large clouds by place: blocks, compact and of bounded size, and an order in which neighbours are close."""
+"""Large clouds by place: blocks, compact and of bounded size, and an order in which neighbors are close."""
 
 from typing import NamedTuple
 

@@ -5,7 +5,7 @@ from torch import Tensor
 
 
 def rotation_matrix(clouds: int, *, generator: torch.Generator, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Uniform random rotations, (clouds, 3, 3): unit quaternions from normalised Gaussians (Shoemake 1992)."""
+    """Uniform random rotations, (clouds, 3, 3): unit quaternions from normalized Gaussians (Shoemake 1992)."""
     quaternion = torch.randn(clouds, 4, generator=generator, dtype=dtype, device=generator.device)
     w, x, y, z = (quaternion / quaternion.norm(dim=1, keepdim=True)).unbind(1)
     return torch.stack(

@@ -11,7 +11,7 @@ from pnu.io.fields import COLOR, NORMAL, XYZ
 
 POINT_ARRAYS = ("points", "xyz", "point", "pos", "position", "positions", "coords", "coord", "vertices", "pc", "cloud")
 NORMAL_ARRAYS = ("normals", "normal")
-COLOR_ARRAYS = ("colors", "color", "colours", "rgb")
+COLOR_ARRAYS = ("colors", "color", "colors", "rgb")
 LARGEST = 1000  # bytes that a byte of an archive may hold: deflate makes no more
 
 

@@ -29,7 +29,7 @@ class Cloud(NamedTuple):
     """Points, their normals or None, and what else the file says about each point.
 
     points (n, 3) float64; normals (n, 3) float64 of length 1, NaN where a point has none.
-    attributes: name -> (n,) or (n, k). Colours are "colors", (n, 3) or (n, 4) uint8.
+    attributes: name -> (n,) or (n, k). Colors are "colors", (n, 3) or (n, 4) uint8.
     notes: what was found and done while it was read, a line each: left out, taken for something, changed.
     """
 

@@ -118,7 +118,7 @@ def _read_ply(path: Path) -> Geometry:
 
 
 def read_obj(path: Path) -> Geometry:
-    """Wavefront: v (with colours behind), vn, f. A vertex normal is the mean of those that its corners name."""
+    """Wavefront: v (with colors behind), vn, f. A vertex normal is the mean of those that its corners name."""
     rows: dict[str, list[str]] = {"v": [], "vn": []}
     faces: list[tuple[str, int, int]] = []  # and how many vertices and normals were read before
     for line in _obj_lines(path):
@@ -189,7 +189,7 @@ def _obj_faces(path: Path, faces: list[tuple[str, int, int]]) -> tuple[np.ndarra
 
 
 def read_off(path: Path) -> Geometry:
-    """Object file format, with normals (NOFF) and colours (COFF) of the vertices."""
+    """Object file format, with normals (NOFF) and colors (COFF) of the vertices."""
     lines = [line for line in (raw.partition("#")[0].strip() for raw in text_lines(path)) if line]
     words = lines[0].split() if lines else []
     head, found, rest = (words[0] if words else "").partition("OFF")

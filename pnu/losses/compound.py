@@ -1,7 +1,7 @@
 """The paper's compound loss: one function a term, and their weighted sum.
 
 Clouds are `prediction` (B, m, 6) and `target` (B, n, 6), columns xyz and normal; predicted normals need not have unit
-length. Terms are unweighted scalars. `reduction="mean"` (released code) averages over points and neighbours,
+length. Terms are unweighted scalars. `reduction="mean"` (released code) averages over points and neighbors,
 `"sum"` (the paper's equations) adds them up in each cloud; both average over the batch. Distances are squared and in
 the clouds' units. Which point is near which is found once, without gradient, and shared by all terms (`search`).
 """
@@ -31,7 +31,7 @@ class Matches(NamedTuple):
 
 
 def search(prediction: Tensor, target: Tensor, k: int, *, released_rounding: bool = True) -> Matches:
-    """Nearest points of clouds (B, m, 3+) and (B, n, 3+), and the k neighbours of each predicted point.
+    """Nearest points of clouds (B, m, 3+) and (B, n, 3+), and the k neighbors of each predicted point.
 
     With `released_rounding`, near-ties of the nearest prediction are decided as in the released code.
 
@@ -90,9 +90,9 @@ def emd(prediction: Tensor, target: Tensor, reduction: Reduction = "mean") -> Te
 
 
 def point_knn(prediction: Tensor, around: Tensor, reduction: Reduction = "mean") -> Tensor:
-    """Eq. 3: squared distances of each prediction (B, m, 3+) to its k neighbours `around` (B, m, k, 3+).
+    """Eq. 3: squared distances of each prediction (B, m, 3+) to its k neighbors `around` (B, m, k, 3+).
 
-    The released code, and the paper's text and Fig. 3, take the neighbours in the prediction; its formula says in the
+    The released code, and the paper's text and Fig. 3, take the neighbors in the prediction; its formula says in the
     ground truth.
     """
     return _reduce((prediction[:, :, None, :3] - around[..., :3]).square().sum(-1), reduction)
@@ -113,7 +113,7 @@ def normal(prediction: Tensor, target: Tensor, matches: Matches, reduction: Redu
 
 
 def normal_orth(prediction: Tensor, around: Tensor, reduction: Reduction = "mean", absolute: bool = True) -> Tensor:
-    """Eq. 5: cosine between p - neighbour and the normal at p, for k predicted neighbours `around` (B, m, k, 6).
+    """Eq. 5: cosine between p - neighbor and the normal at p, for k predicted neighbors `around` (B, m, k, 6).
 
     Released: its absolute value; paper: signed. Coincident points and zero normals count as orthogonal.
     """
@@ -125,7 +125,7 @@ def normal_orth(prediction: Tensor, around: Tensor, reduction: Reduction = "mean
 
 
 def normal_knn(prediction: Tensor, around: Tensor, reduction: Reduction = "mean") -> Tensor:
-    """Eq. 6: squared difference of each predicted normal to those of its k predicted neighbours (B, m, k, 6)."""
+    """Eq. 6: squared difference of each predicted normal to those of its k predicted neighbors (B, m, k, 6)."""
     return _reduce((prediction[:, :, None, 3:6] - around[..., 3:6]).square().sum(-1), reduction)
 
 
@@ -137,17 +137,17 @@ class CompoundLoss(nn.Module):
 
     Args:
         w1: weight of the point term: Chamfer distance (Eq. 1), or EMD (Eq. 2)
-        w2: weight of point_knn: neighbours close (Eq. 3)
+        w2: weight of point_knn: neighbors close (Eq. 3)
         w3: weight of normal: predicted against true normals (Eq. 4)
         w4: weight of normal_orth: normals orthogonal to the surface (Eq. 5)
-        w5: weight of normal_knn: normals of neighbours alike (Eq. 6)
-        k: neighbours of the three neighbourhood terms
-        reduction: mean over points and neighbours (released code), or sum over them (the paper's equations)
+        w5: weight of normal_knn: normals of neighbors alike (Eq. 6)
+        k: neighbors of the three neighborhood terms
+        reduction: mean over points and neighbors (released code), or sum over them (the paper's equations)
         point_term: what w1 weighs: chamfer, or emd (the paper defines it; many times slower); cd is reported too
-        point_knn_in: where its neighbours are: prediction (released code; the paper's text, Fig. 3) or target (Eq. 3)
+        point_knn_in: where its neighbors are: prediction (released code; the paper's text, Fig. 3) or target (Eq. 3)
         normal_pairs: target: each with its nearest prediction (released code); prediction: the other way
         orth: cosine of normal_orth: absolute (released code) or signed (Eq. 5)
-        unit_normals: normalise predicted normals before the loss; the released code does not
+        unit_normals: normalize predicted normals before the loss; the released code does not
         near_ties: of the nearest prediction: released (its rounding decides) or exact
     """
 
@@ -175,7 +175,7 @@ class CompoundLoss(nn.Module):
         _check("orth", orth, "absolute", "signed")
         _check("near_ties", near_ties, "released", "exact")
         if k < 1:
-            raise ValueError(f"loss.k: expected at least 1 neighbour, found {k}")
+            raise ValueError(f"loss.k: expected at least 1 neighbor, found {k}")
         point = "cd" if point_term == "chamfer" else "emd"
         self.weights = {point: w1, "point_knn": w2, "normal": w3, "normal_orth": w4, "normal_knn": w5}
         self.k, self.reduction, self.point_knn_in, self.normal_pairs = k, reduction, point_knn_in, normal_pairs
@@ -210,7 +210,7 @@ class CompoundLoss(nn.Module):
         return {**terms, "loss": torch.stack(weighted).sum() if weighted else 0 * terms["cd"]}
 
     def neighborhood_terms(self, prediction: Tensor, neighbors: Tensor) -> dict[str, Tensor]:
-        """point_knn, and with normals normal_orth and normal_knn, of the neighbours (B, m, k) of each prediction."""
+        """point_knn, and with normals normal_orth and normal_knn, of the neighbors (B, m, k) of each prediction."""
         around = gather(prediction, neighbors)
         terms = {"point_knn": point_knn(prediction, around, self.reduction)}
         if prediction.shape[-1] >= 6:

@@ -12,7 +12,7 @@ from pnu.losses.compound import TINY
 class SurfaceLoss(nn.Module):
     """Objective of the surface model: distance and normal to the closest point of the true surface, in every round.
 
-    Terms, each a mean over queries and a sum over rounds, lengths in spacings of the neighbours:
+    Terms, each a mean over queries and a sum over rounds, lengths in spacings of the neighbors:
     "distance" to the surface, found anew for each prediction; "drift" from the surface point closest to the query, with
     weight w_drift, which keeps a seed at its place; "normal", length of the difference of unit normals, w_normal;
     "calibration" of the predicted logarithm of the distance (Laplace), w_error. Queries whose closest surface looks

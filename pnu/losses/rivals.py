@@ -24,14 +24,14 @@ def total(terms: dict[str, Tensor], weights: Mapping[str, float]) -> dict[str, T
 class RepulsionLoss(nn.Module):
     """PU-Net (section 3.4): reconstruction + w_repulsion * repulsion.
 
-    Repulsion is the mean over points and their k neighbours at distance r of eta(r) w(r), eta(r) = -r and
-    w(r) = exp(-r^2 / h), so it is negative and grows in magnitude where close neighbours move apart.
+    Repulsion is the mean over points and their k neighbors at distance r of eta(r) w(r), eta(r) = -r and
+    w(r) = exp(-r^2 / h), so it is negative and grows in magnitude where close neighbors move apart.
 
     Args:
         point_term: chamfer, or emd (the paper's earth mover's distance; many times slower)
         w_repulsion: weight of the repulsion, the paper's alpha
         h: squared reach of the repulsion, in the unit sphere, for 4096 target points; for n it is h 4096 / n
-        k: neighbours that repel a point
+        k: neighbors that repel a point
     """
 
     def __init__(self, point_term: Literal["chamfer", "emd"] = "chamfer", w_repulsion: float = 0.01, h: float = 5e-4,
@@ -63,7 +63,7 @@ class EdgeAwareLoss(nn.Module):
 
     surface: squared distance of new points to the true surface; the dense target stands for the mesh: distance to the
     tangent plane of the nearest target point, plus what lies beyond the target's spacing within that plane.
-    repulsion: mean over k neighbours at distance r of max(0, h^2 - r^2), with h for 4096 target points; for n it is
+    repulsion: mean over k neighbors at distance r of max(0, h^2 - r^2), with h for 4096 target points; for n it is
     h sqrt(4096 / n).
     edge: mean squared true distance to the nearest edge over the points whose regressed distance is below `near`.
     edge_distance: mean squared difference of regressed and true distance, both truncated to [0, reach].
@@ -77,7 +77,7 @@ class EdgeAwareLoss(nn.Module):
         w_edge: weight of the distance of edge points to the edges
         w_edge_distance: weight of the regressed distance to the nearest edge
         h: reach of the repulsion, in the unit sphere, for 4096 target points; for n it is h sqrt(4096 / n)
-        k: neighbours that repel a point
+        k: neighbors that repel a point
         near: regressed distance below which a point belongs to an edge
         reach: distances to edges are truncated there
     """
@@ -138,7 +138,7 @@ def surface_distance_sq(points: Tensor, target: Tensor, nearest_target: Tensor) 
 
 
 def target_spacing(target: Tensor) -> Tensor:
-    """(B,) median distance of target points to their nearest neighbour."""
+    """(B,) median distance of target points to their nearest neighbor."""
     points = target[..., :3]
     return knn(points, points, 2).dist_sq[..., 1].sqrt().median(1).values
 

@@ -198,11 +198,11 @@ def uniformity(
 ) -> Tensor:
     """Evenness of the density: spread over disks of equal area of (points in the disk) / (points expected there).
 
-    The normalised uniformity coefficient of PU-Net (Yu et al. 2018, section 4.2) for one share p of the surface: the
+    The normalized uniformity coefficient of PU-Net (Yu et al. 2018, section 4.2) for one share p of the surface: the
     standard deviation over the disks of n_i / (n p). A disk is the ball around a truth point that holds the share p of
     the truth (a dense uniform sampling of the surface; p is its share in the ball, ties at the rim included). It stands
     in for PU-Net's geodesic disk and has equal area by construction, also where the surface is curved or thin.
-    0 is perfect; no unit. `spacing_cv` sees the distances between neighbours, this one larger clusters and holes.
+    0 is perfect; no unit. `spacing_cv` sees the distances between neighbors, this one larger clusters and holes.
 
     >>> line = np.stack([np.arange(100.0), np.zeros(100), np.zeros(100)], axis=1)
     >>> float(uniformity(line, line, share=0.1)), float(uniformity(line[:50], line, share=0.1)) > 0.5

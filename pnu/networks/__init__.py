@@ -12,7 +12,7 @@ from torch import nn
 from pnu.config.instantiate import is_within, present_name
 
 
-def build(config: Mapping[str, Any], allow: Sequence[str] = ()) -> nn.Module:
+def build_network(config: Mapping[str, Any], allow: Sequence[str] = ()) -> nn.Module:
     """Build a network from a plain config: `_target_` names its class, the other keys are its arguments.
 
     Only classes below `pnu.networks`, and of the packages `allow`, are built: a config from elsewhere runs no other
@@ -21,7 +21,8 @@ def build(config: Mapping[str, Any], allow: Sequence[str] = ()) -> nn.Module:
     Raises:
         ValueError: `_target_` is missing, lies outside these packages, or does not accept the arguments.
     """
-    arguments = {str(key): value for key, value in config.items()}
+    # as older runs and weights spell it
+    arguments = {str(key).replace("neighbour", "neighbor"): value for key, value in config.items()}
     target = present_name(str(arguments.pop("_target_", "")))
     module_name, _, class_name = target.rpartition(".")
     packages = ("pnu.networks", *allow)

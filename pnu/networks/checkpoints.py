@@ -81,7 +81,7 @@ def resolve(source: str | PathLike[str]) -> str | PathLike[str]:
 def _unfilled(config: Mapping[str, Any]) -> nn.Module:
     """The network of a config, to be filled, in float32; what it draws at first leaves no trace in the generator."""
     with torch.device("cpu"), torch.random.fork_rng(devices=[]):
-        return networks.build(config).float()
+        return networks.build_network(config).float()
 
 
 def run_config(folder: Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Layers shared by the networks. Features are channel last, (..., C); a row is a point or a neighbour of one."""
+"""Layers shared by the networks. Features are channel last, (..., C); a row is a point or a neighbor of one."""
 
 import itertools
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from pnu.networks.norm import BatchNorm
 class Layer(nn.Module):
     """Linear, batch norm over all rows, ReLU: (..., C) -> (..., C').
 
-    Without bias it is initialised as in PointNet++ (Kaiming, normal), else as a convolution of torch, both as released.
+    Without bias it is initialized as in PointNet++ (Kaiming, normal), else as a convolution of torch, both as released.
     """
 
     def __init__(self, width_in: int, width_out: int, *, bias: bool = True) -> None:
@@ -53,12 +53,12 @@ class JoinedMLP(MLP):
 
 
 class Abstraction(nn.Module):
-    """Set abstraction of PointNet++: shared MLP over [offset, feature] of the neighbours, then their maximum.
+    """Set abstraction of PointNet++: shared MLP over [offset, feature] of the neighbors, then their maximum.
 
     Args:
         widths: of the features and of the layers.
-        radius: of the ball around a centre.
-        k: neighbours that are taken from it (`ball_query`).
+        radius: of the ball around a center.
+        k: neighbors that are taken from it (`ball_query`).
     """
 
     def __init__(self, widths: Sequence[int], radius: float, k: int = 32) -> None:

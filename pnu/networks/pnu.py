@@ -54,13 +54,13 @@ def levels(points: Tensor, number: int) -> list[Tensor]:
 class PNU(nn.Module):
     """Point and normal upsampling network, as released: patches (B, n, 6) -> (B, ratio n, 6), n >= 64.
 
-    Patches hold points in the unit sphere and their unit normals; predicted normals are not normalised.
+    Patches hold points in the unit sphere and their unit normals; predicted normals are not normalized.
 
     Args:
         ratio: points out for each point in: 2, 4, 8 or 16
         input_normals: read the normals of the patch; without, they are ignored and may be missing
         predict_normals: predict normals beside points; without, the output has 3 columns
-        local_features: PointNet++ features of each point's neighbourhood (256)
+        local_features: PointNet++ features of each point's neighborhood (256)
         global_features: PointNet features of the whole patch (512)
         residual: predict what is added to the input point and normal; ours, neither the paper's nor its code's
 

@@ -12,7 +12,7 @@ RADII = (0.1, 0.2, 0.3, 0.4)
 class MultiscaleFeatures(nn.Module):
     """Balls of several radii around each point, one shared MLP (32, 64, 128), maximum: (B, n, C) -> (B, n, 128).
 
-    What Fig. 1 leaves open is chosen so: radii and neighbours of the released code (four radii also explain the
+    What Fig. 1 leaves open is chosen so: radii and neighbors of the released code (four radii also explain the
     figure's label "n x 512"); offsets in units of the radius, so that a shared MLP sees every scale alike; the
     maximum over the scales, which leaves the 128 features of the concatenation.
     """

@@ -14,7 +14,7 @@ WIDTHS = (64, 64, 128, 128)
 
 
 class EdgeConvolution(nn.Module):
-    """Maximum over neighbours j of ReLU(BN(A x_i + B (x_j - x_i))): (B, n, C) -> (B, n, C') (DGCNN).
+    """Maximum over neighbors j of ReLU(BN(A x_i + B (x_j - x_i))): (B, n, C) -> (B, n, C') (DGCNN).
 
     `center` is A - B and `neighbor` B: A x_i + B (x_j - x_i) = (A - B) x_i + B x_j.
     """
@@ -45,7 +45,7 @@ class PUGeo(nn.Module):
         ratio: points out for each point in: 2 or more
 
     Source: Qian, Hou, Kwong, He, "PUGeo-Net: A Geometry-centric Network for 3D Point Cloud Upsampling", ECCV 2020.
-    Neighbours are those in space, searched once (the paper's extractor searches again in feature space).
+    Neighbors are those in space, searched once (the paper's extractor searches again in feature space).
     """
 
     predicts_normals = True

@@ -14,7 +14,7 @@ MINIMUM = 64
 
 
 class HierarchicalFeatures(nn.Module):
-    """Point features from growing neighbourhoods: points (B, n, 3) -> (B, n, 259).
+    """Point features from growing neighborhoods: points (B, n, 3) -> (B, n, 259).
 
     Four set abstractions keep n, n/2, n/4 and n/8 farthest points; each level is interpolated back to all points by
     inverse distance, reduced to 64 channels and concatenated, beside the coordinates (PU-Net, section 3.2).

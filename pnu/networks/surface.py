@@ -1,7 +1,7 @@
 """Learned surface projection: points near a cloud are moved onto the surface that it samples.
 
 A query sees its nearest input points with their normals in a local frame (`pnu.geometry.local_frames`). An algebraic
-sphere gives a first foot and normal; a small network shared by all neighbours, with maximum and attention pooling,
+sphere gives a first foot and normal; a small network shared by all neighbors, with maximum and attention pooling,
 corrects both. How clouds become dense with it, is in `pnu.upsamplers.surface_projection`.
 """
 
@@ -17,7 +17,7 @@ from pnu.geometry.sampling import farthest_points
 
 EACH = 3  # seeds of a point, in training, before they are thinned out
 PUSH = 0.1  # between rounds of training, beside the way from its point to a seed
-DENSE = 16  # neighbours that are all looked at; farther ones are thinned out
+DENSE = 16  # neighbors that are all looked at; farther ones are thinned out
 
 
 class Projector(nn.Module):
@@ -36,20 +36,20 @@ class Projector(nn.Module):
         nn.init.zeros_(self.out.bias)
 
     def forward(self, offsets: Tensor, normals: Tensor, hint: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Neighbours relative to the query (m, k, 3), their normals, the query's rough normal (m, 3) ->
+        """Neighbors relative to the query (m, k, 3), their normals, the query's rough normal (m, 3) ->
 
         step (m, 3), unit normal (m, 3), logarithm of the expected error in spacings (m,), spacing (m, 1)."""
         with torch.no_grad():
             frame = local_frames(offsets, normals, hint, sphere=self.sphere)
         y = self.second(self.first(frame.features).relu_()).relu_()
         context = self.context(torch.cat([y.amax(1), self.weighed(y.clone(), y), frame.height], -1))
-        # the bias is added to the few contexts, not to the many neighbours
+        # the bias is added to the few contexts, not to the many neighbors
         y = linear(y, self.third.weight).add_((context + self.third.bias)[:, None]).relu_()
         of_features, of_choices = self.attention.weight.split([y.shape[-1], 2])
         seen = self.weighed(linear(y, of_features), y)
         choice = self.shares(linear(y, of_choices))
         out = self.out(self.head(torch.cat([y.amax(1), seen, context], -1)))
-        # beside what the network finds freely, it chooses among the neighbours' normals and their bent planes
+        # beside what the network finds freely, it chooses among the neighbors' normals and their bent planes
         bent = (choice[..., 1] * frame.features[..., 7]).sum(1)
         step = torch.cat([out[:, :2], (out[:, 2] + 0.5 * bent)[:, None]], 1)
         normal = (choice[..., :1] * frame.features[..., 3:6]).sum(1) + out[:, 3:6]
@@ -57,7 +57,7 @@ class Projector(nn.Module):
         return frame.base + frame.spacing * step, normalize(normal, dim=-1), out[:, 6], frame.spacing
 
     def weighed(self, logits: Tensor, y: Tensor) -> Tensor:
-        """Sum of y (m, k, c) over the neighbours, by their `shares`: (m, c). Without gradient it overwrites logits."""
+        """Sum of y (m, k, c) over the neighbors, by their `shares`: (m, c). Without gradient it overwrites logits."""
         if torch.is_grad_enabled() or not self.attend:
             return (self.shares(logits) * y).sum(1)
         shares = logits.sub_(logits.amax(1, keepdim=True)).exp_()
@@ -65,7 +65,7 @@ class Projector(nn.Module):
         return shares.mul_(y).sum(1).div_(total)
 
     def shares(self, logits: Tensor) -> Tensor:
-        """Weights of the neighbours, for each of the features (m, k, c); all alike without attention."""
+        """Weights of the neighbors, for each of the features (m, k, c); all alike without attention."""
         return logits.softmax(1) if self.attend else torch.full_like(logits, 1 / logits.shape[1])
 
 
@@ -76,7 +76,7 @@ class Surface(nn.Module):
 
     Args:
         ratio: points out for each point in, where a command asks for none
-        neighbours: input points that a seed looks at
+        neighbors: input points that a seed looks at
         reach: rank of the farthest of them; beyond the 16 nearest they are thinned out evenly
         width: of the network
         rounds: projections in training; at work there are 1 + refinements
@@ -87,8 +87,8 @@ class Surface(nn.Module):
         refinements: projections after the even spacing; one more is nearer to the surface and a little less even
         reject: share of points made too many; the worst of their surroundings by expected error are dropped
         queries: seeds of a crop, in training
-        sphere: start from the sphere that fits the neighbours (algebraic point set surface), not from the seed
-        attention: weigh the neighbours; without it all count alike
+        sphere: start from the sphere that fits the neighbors (algebraic point set surface), not from the seed
+        attention: weigh the neighbors; without it all count alike
     """
 
     predicts_normals = True
@@ -96,19 +96,17 @@ class Surface(nn.Module):
     patch_size = 1024
 
     def __init__(
-        self, ratio: int = 4, neighbours: int = 24, reach: int = 24, width: int = 64, rounds: int = 2,
+        self, ratio: int = 4, neighbors: int = 24, reach: int = 24, width: int = 64, rounds: int = 2,
         seeds: float = 4, candidates: float = 2, shortlist: float = 1.15,
         relaxation: int = 2, refinements: int = 2, reject: float = 0.003,
         queries: int = 64, sphere: bool = True, attention: bool = True,
     ) -> None:  # fmt: skip
         super().__init__()
-        self.ratio, self.neighbours, self.reach, self.rounds = ratio, neighbours, reach, rounds
+        self.ratio, self.neighbors, self.reach, self.rounds = ratio, neighbors, reach, rounds
         self.seeds, self.candidates, self.shortlist = seeds, candidates, shortlist
         self.relaxation, self.refinements, self.reject, self.queries = relaxation, refinements, reject, queries
-        if not 4 <= neighbours <= reach:
-            raise ValueError(
-                f"model.reach={reach}: expected at least model.neighbours={neighbours}, which is at least 4"
-            )
+        if not 4 <= neighbors <= reach:
+            raise ValueError(f"model.reach={reach}: expected at least model.neighbors={neighbors}, which is at least 4")
         if reject < 0:
             raise ValueError(f"model.reject={reject}: expected a share of the points, 0 or more")
         for name in ("rounds", "seeds", "candidates", "shortlist", "refinements"):
@@ -153,11 +151,11 @@ class Surface(nn.Module):
     def project(self, query: Tensor, clouds: Tensor, idx: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """query (B, m, 6), clouds (B, n, 6) -> projected (B, m, 6), log error (B, m), spacing (B, m).
 
-        idx: their `neighbors`, where they are known.
+        idx: their `neighbor_indices`, where they are known.
         """
         batch, m, _ = query.shape
         like = self.projector.out.weight
-        idx = self.neighbors(query, clouds) if idx is None else idx
+        idx = self.neighbor_indices(query, clouds) if idx is None else idx
         near = clouds[torch.arange(batch, device=idx.device)[:, None, None], idx]
         offsets = (near[..., :3] - query[:, :, None, :3]).flatten(0, 1).to(like)
         step, normal, log_error, spacing = self.projector(
@@ -170,15 +168,15 @@ class Surface(nn.Module):
             spacing.view(batch, m),
         )
 
-    def neighbors(self, query: Tensor, clouds: Tensor) -> Tensor:
+    def neighbor_indices(self, query: Tensor, clouds: Tensor) -> Tensor:
         """Points of clouds (B, n, 6) that queries (B, m, 6) look at: (B, m, k)."""
         n = clouds.shape[1]
         return knn(query[..., :3], clouds[..., :3], min(self.reach, n)).idx[..., self.ranks(n)]
 
     def ranks(self, n: int) -> list[int]:
-        """Ranks of the neighbours that are looked at, of those that a cloud of n points has."""
-        far = torch.linspace(DENSE, self.reach - 1, max(self.neighbours - DENSE, 0)).round().long().tolist()
-        return [rank for rank in [*range(min(DENSE, self.neighbours)), *far] if rank < n]
+        """Ranks of the neighbors that are looked at, of those that a cloud of n points has."""
+        far = torch.linspace(DENSE, self.reach - 1, max(self.neighbors - DENSE, 0)).round().long().tolist()
+        return [rank for rank in [*range(min(DENSE, self.neighbors)), *far] if rank < n]
 
     def forward(self, patch: Tensor) -> Tensor:
         """As in training: patch (B, n, 6) -> (B, queries, 6). Whole clouds: `pnu.upsamplers.surface_projection`."""

@@ -154,7 +154,7 @@ def trim(surface: Surface, quantile: float) -> Surface:
 
 
 def interpolate(points: NDArray, values: NDArray, query: NDArray, k: int = 4) -> Array:
-    """Values `(n, c)` of points `(n, 3)`, such as colours, at `query` `(m, 3)`: k nearest, by inverse distance."""
+    """Values `(n, c)` of points `(n, 3)`, such as colors, at `query` `(m, 3)`: k nearest, by inverse distance."""
     far, near = cKDTree(points).query(query, k=np.arange(1, min(k, len(points)) + 1))
     weight = 1 / (far + 1e-9 * (far.max() or 1.0))
     return (weight[..., None] * np.asarray(values, np.float64)[near]).sum(1) / weight.sum(1, keepdims=True)

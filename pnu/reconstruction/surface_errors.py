@@ -43,7 +43,7 @@ class SurfaceErrors(NamedTuple):
         return "\n".join(rows)
 
     def colors(self, limit: float | None = None, colormap: str = "error") -> NDArray[np.uint8]:
-        """Colours `(v, 3)` of the distances from 0 to `limit`; default: `typical_limit` of them."""
+        """Colors `(v, 3)` of the distances from 0 to `limit`; default: `typical_limit` of them."""
         return value_colors(self.distance, (0, limit or typical_limit(self.distance)), colormap)
 
     def _by_name(self) -> dict[str, Array]:

@@ -1,4 +1,4 @@
-"""Colours of numbers and normals, as 8-bit sRGB."""
+"""Colors of numbers and normals, as 8-bit sRGB."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,16 +50,16 @@ COLORMAPS = {"error": _error, "perceptual": _perceptual}
 
 
 def value_colors(values: NDArray, limits: tuple[float, float], colormap: str = "error") -> Colors:
-    """Colours `(..., 3)` of numbers `(...)`; what lies outside `limits` gets the colour of the nearer end.
+    """Colors `(..., 3)` of numbers `(...)`; what lies outside `limits` gets the color of the nearer end.
 
     `colormap` is "error" (red = low, over green, blue = high, as the paper) or "perceptual" (dark = low, light = high,
-    in even steps of lightness). NaN is grey.
+    in even steps of lightness). NaN is gray.
     """
     if colormap not in COLORMAPS:
         raise ValueError(f"colormap={colormap!r}: expected one of {', '.join(COLORMAPS)}")
     low, high = limits
     if not (np.isfinite([low, high]).all() and high > low):
-        raise ValueError(f"colour limits {low}, {high}: expected two finite numbers, the second larger")
+        raise ValueError(f"color limits {low}, {high}: expected two finite numbers, the second larger")
     known = np.isfinite(values)
     t = np.clip((np.where(known, values, low) - low) / (high - low), 0, 1)
     rgb = np.where(known[..., None], COLORMAPS[colormap](t), 0.6)
@@ -67,10 +67,10 @@ def value_colors(values: NDArray, limits: tuple[float, float], colormap: str = "
 
 
 def typical_limit(errors: NDArray) -> float:
-    """The end of a colour scale that starts at 0: what 98 % of the errors stay below."""
+    """The end of a color scale that starts at 0: what 98 % of the errors stay below."""
     return float(np.quantile(errors, 0.98)) or float(errors.max()) or 1e-12
 
 
 def normal_colors(normals: NDArray) -> Colors:
-    """Colours `(n, 3)` of unit normals `(n, 3)`: x, y, z from -1..1 to red, green, blue from 0..255."""
+    """Colors `(n, 3)` of unit normals `(n, 3)`: x, y, z from -1..1 to red, green, blue from 0..255."""
     return np.rint(127.5 * (np.clip(normals, -1, 1) + 1)).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Several panels in one figure, with captions and a colour bar."""
+"""Several panels in one figure, with captions and a color bar."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,7 +19,7 @@ DPI = 100  # of the color bar: a unit of matplotlib's sizes
 
 
 class ColorBar(NamedTuple):
-    """What the colours of `value_colors` mean."""
+    """What the colors of `value_colors` mean."""
 
     limits: tuple[float, float]
     label: str = ""
@@ -34,7 +34,7 @@ def figure(
     colorbar: ColorBar | None = None,
     crop: bool = True,
 ) -> Picture:
-    """Panels `(h, w, 3)` of one size in rows of `columns` (default: up to six), captions below, colour bar right.
+    """Panels `(h, w, 3)` of one size in rows of `columns` (default: up to six), captions below, color bar right.
 
     crop: cut white margins that all panels have in common. Lines in a caption are parted by "\\n". ValueError for a
     blank panel, panels of different sizes or a wrong number of captions.

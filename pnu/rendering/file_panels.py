@@ -43,7 +43,7 @@ class Shape(NamedTuple):
         return color
 
     def colors(self, color: str, bar: ColorBar | None) -> NDArray[np.uint8] | None:
-        """Colours `(n, 3)` of the points; None for the surface's own."""
+        """Colors `(n, 3)` of the points; None for the surface's own."""
         source = self.source(color)
         if source == "quality" and bar is not None:
             return value_colors(self.attributes["quality"], bar.limits, bar.colormap)
@@ -80,7 +80,7 @@ def read_shape(path: str, columns: str | None = None) -> Shape:
 
 
 def quality_bar(shapes: Sequence[Shape], color: str, limit: float | None, colormap: str, label: str) -> ColorBar | None:
-    """The one colour scale, from 0, of all shapes that are coloured by quality; None where there are none."""
+    """The one color scale, from 0, of all shapes that are colored by quality; None where there are none."""
     values = [shape.attributes["quality"] for shape in shapes if shape.source(color) == "quality"]
     if not values:
         return None

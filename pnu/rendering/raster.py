@@ -44,7 +44,7 @@ class DepthBuffer:
 def triangles(corners: Array, height: int, width: int) -> Fragments:
     """Visible triangles; corners `(f, 3, 3)`.
 
-    A pixel belongs to a triangle where its middle lies inside (half-open: neighbours leave no gap and share none).
+    A pixel belongs to a triangle where its middle lies inside (half-open: neighbors leave no gap and share none).
     """
     lowest, highest = corners[:, :, 2].min(1), corners[:, :, 2].max(1)
     buffer = DepthBuffer(height * width, lowest.min(initial=0), highest.max(initial=0))

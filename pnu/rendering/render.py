@@ -14,9 +14,9 @@ from pnu.rendering.colors import normal_colors
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-CLAY = (222, 224, 228)  # a surface without colours
+CLAY = (222, 224, 228)  # a surface without colors
 BACK = (214, 180, 160)  # the inside of a surface, seen through a hole or because it is inside out
-STONE = (130, 142, 160)  # points without colours and normals
+STONE = (130, 142, 160)  # points without colors and normals
 
 
 def render_cloud(
@@ -31,7 +31,7 @@ def render_cloud(
 ) -> Image:
     """A picture `(size, size, 3)` of a cloud `(n, 3)` or `(n, 6)` on white, each point a small ball lit by its normal.
 
-    colors: `(n, 3)` 8-bit sRGB; by default normals as colours, or grey for a cloud without normals. radius: of a ball,
+    colors: `(n, 3)` 8-bit sRGB; by default normals as colors, or gray for a cloud without normals. radius: of a ball,
     in units of the points; by default 0.4 of the spacing. hide: leave out points that the surface in front of them
     would cover, although one could see between its points. ValueError if the picture would be blank.
     """
@@ -70,7 +70,7 @@ def render_mesh(
 ) -> Image:
     """A picture `(size, size, 3)` of a triangle mesh on white, smooth or flat shaded; sharp edges stay sharp.
 
-    vertex_colors: `(v, 3)` 8-bit sRGB. Without them the surface is grey and its inside, where it shows, brown.
+    vertex_colors: `(v, 3)` 8-bit sRGB. Without them the surface is gray and its inside, where it shows, brown.
     ValueError if the picture would be blank.
     """
     vertices, faces = mesh.vertices, mesh.faces
@@ -99,7 +99,7 @@ def render_mesh(
 def develop(
     pixel: NDArray[np.int64], depth: Array, normal: Array, color: Array, pixels: int, supersample: int
 ) -> Image:
-    """Shade the visible pixels (flat indices `(m,)`, their depth, normal, colour) and average them over white."""
+    """Shade the visible pixels (flat indices `(m,)`, their depth, normal, color) and average them over white."""
     if not len(pixel):
         raise ValueError("picture: nothing to see; the camera looks past the points or they are smaller than a pixel")
     row, column = np.divmod(pixel, pixels)

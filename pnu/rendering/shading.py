@@ -1,4 +1,4 @@
-"""From what is visible to colours: two lights, sky light, occlusion by neighbours, a soft gloss."""
+"""From what is visible to colors: two lights, sky light, occlusion by neighbors, a soft gloss."""
 
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ LIGHTS = (((-0.55, 0.60, 0.58), 0.80), ((0.90, 0.05, 0.43), 0.12))
 SKY, GROUND = 0.30, 0.10  # light from above and below that reaches an open surface
 GLOSS, SHARPNESS = 0.10, 24.0
 OCCLUSION = 0.9  # how dark a closed-in corner gets, 0 to switch off
-REACH = (0.012, 0.028, 0.06)  # where neighbours are looked at, in picture sides
+REACH = (0.012, 0.028, 0.06)  # where neighbors are looked at, in picture sides
 DIRECTIONS = 8
 
 Image = NDArray[np.float32]
@@ -64,7 +64,7 @@ def openness(surface: Surface, side: float) -> Image:
 
 
 def shade(surface: Surface, side: float) -> Image:
-    """Colours `(h, w, 3)`, linear light in 0..1."""
+    """Colors `(h, w, 3)`, linear light in 0..1."""
     n = surface.normal
     light = np.zeros(n.shape[:2], np.float32)
     gloss = np.zeros_like(light)

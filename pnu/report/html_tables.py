@@ -12,7 +12,7 @@ class Column(NamedTuple):
     head: str
     form: str = ".3f"
     best: bool = True
-    group: str = ""  # a head over neighbouring columns
+    group: str = ""  # a head over neighboring columns
     better: str = "lower"
 
 

@@ -79,7 +79,7 @@ def rebuild(shown: Shown, seed: int = 0) -> tuple[dict[str, Rebuilt], list[str]]
 
 
 def error_limit(errors: Sequence[NDArray]) -> float:
-    """One end of the colours for all: what 98 % of the errors of the median method stay below."""
+    """One end of the colors for all: what 98 % of the errors of the median method stay below."""
     return float(np.median([typical_limit(error) for error in errors])) if errors else 1e-2
 
 
@@ -145,7 +145,7 @@ def figure(shown: Shown, rebuilt: Mapping[str, Rebuilt], look: Look) -> NDArray[
 
 
 def or_crossed(render: Callable[..., Picture], what: Any, camera: rendering.Camera, look: Look, *args: Any) -> Picture:
-    """A panel, or a grey cross where a method's result is nowhere near the true shape."""
+    """A panel, or a gray cross where a method's result is nowhere near the true shape."""
     try:
         return render(what, *args, camera=camera, size=look.size)
     except ValueError:

@@ -121,7 +121,7 @@ def markdown(study: Study, drawn: Mapping[str, Plot], shapes: Sequence[str]) -> 
     for name, plot in drawn.items():
         lines += ["", f"## {plot.caption}", "", f"![{plot.caption}]({name}.svg)"]
     if shapes:
-        lines += ["", "## The same validation clouds for each setting: input, prediction, target; colours are normals"]
+        lines += ["", "## The same validation clouds for each setting: input, prediction, target; colors are normals"]
     for shape in shapes:
         lines += ["", f"![{shape}](cloud_{shape}.webp)"]
     if study.unfinished:

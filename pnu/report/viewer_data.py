@@ -33,7 +33,7 @@ class View(NamedTuple):
     drawings: Sequence[Drawing]
     center: NDArray  # (3,) of the true shape
     radius: float
-    limit: float  # error at the end of the colours, in the unit of the points
+    limit: float  # error at the end of the colors, in the unit of the points
 
 
 class Packer:

@@ -16,7 +16,7 @@ Part = TypeVar("Part")
 Result = TypeVar("Result")
 
 
-def spread(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
+def map_on_threads(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
     """`work` of each part, without gradient, on as many threads as torch uses; results in the order of the parts."""
     threads = torch.get_num_threads()
 

@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsed
 from torch import Tensor
 from torch.utils.tensorboard.summary import hparams
 
-from pnu.config.instantiate import PACKAGES, build, find_class
+from pnu.config.instantiate import PACKAGES, find_class, instantiate
 from pnu.config.signature import arguments
 from pnu.networks.checkpoints import read, write
 from pnu.rendering import figure, look_at, render_cloud, save_png
@@ -254,7 +254,7 @@ def clock(seconds: float) -> str:
 
 
 class Pictures(pl.Callback):
-    """Shows the same validation clouds during training: as 3D clouds in TensorBoard, coloured by normal, and as PNGs,
+    """Shows the same validation clouds during training: as 3D clouds in TensorBoard, colored by normal, and as PNGs,
     there and in the run folder, beside input and target.
 
     Args:
@@ -392,7 +392,7 @@ def board(trainer: pl.Trainer) -> Any:
 
 
 def unit(cloud: np.ndarray) -> np.ndarray:
-    """Unit normals (n, 3) of a cloud (n, 6); zeros, shown grey, for a cloud without normals."""
+    """Unit normals (n, 3) of a cloud (n, 6); zeros, shown gray, for a cloud without normals."""
     if cloud.shape[1] < 6:
         return np.zeros((len(cloud), 3))
     return cloud[:, 3:6] / np.maximum(np.linalg.norm(cloud[:, 3:6], axis=1, keepdims=True), 1e-12)
@@ -412,7 +412,7 @@ def build_all(config: Mapping[str, Any], run: RunFolder) -> list[pl.Callback]:
         if trainer.get("fast_dev_run") and find_class(group["_target_"], "pnu", ("lightning",)) in KEEPERS:
             continue
         own = {"run": run} if "run" in (arguments(str(group["_target_"])) or {}) else {}
-        found.append(build(group, PACKAGES["callbacks"], allow=config.get("allow") or (), **own))
+        found.append(instantiate(group, PACKAGES["callbacks"], allow=config.get("allow") or (), **own))
     return sorted(found, key=lambda callback: (isinstance(callback, EMA), isinstance(callback, Checkpoints)))
 
 
@@ -427,7 +427,9 @@ def build_loggers(config: Mapping[str, Any], run: RunFolder) -> list[Logger]:
         if kind == "CSVLogger":  # which would write over what it has
             group = {**group, "version": unused_name(run.path / (group.get("name") or ""), str(group.get("version")))}
         folder = run.path.absolute() / "mlflow" if kind == "MLFlowLogger" else run.path
-        found.append(build(group, PACKAGES["logger"], allow=config.get("allow") or (), save_dir=str(folder), **more))
+        found.append(
+            instantiate(group, PACKAGES["logger"], allow=config.get("allow") or (), save_dir=str(folder), **more)
+        )
     return found
 
 

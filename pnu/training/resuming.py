@@ -8,7 +8,7 @@ from typing import Any
 
 from pnu.config.compose import flatten, in_multirun
 from pnu.config.quoting import shell_line
-from pnu.config.schema import check
+from pnu.config.schema import checked_config
 from pnu.io import remove_leftovers
 from pnu.training import sweeps
 from pnu.training.run_folder import RunFolder, is_main_process
@@ -100,7 +100,7 @@ def restored(run: RunFolder, config: dict[str, Any], overrides: Sequence[str], s
             raise ValueError(f"{run.config}: expected plain values, found ${{...}}; write out what it stands for")
         if "allow" in config:  # whose code may run is said anew, never by a folder
             written["allow"] = config["allow"]
-        saved = check(written, schema)
+        saved = checked_config(written, schema)
     except (OmegaConfBaseException, YAMLError, AttributeError, TypeError, RecursionError) as error:
         raise ValueError(f"{run.config}: expected the config of a run, found {' '.join(str(error).split())}") from None
     for key in config.keys() - saved.keys():  # of a later version than the run's

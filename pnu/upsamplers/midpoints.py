@@ -16,19 +16,19 @@ class Midpoint:
     Repeated where the points and midpoints of one pass are not enough.
 
     Args:
-        neighbours: of each point; with 10, a pass has about seven points for each one.
+        neighbors: of each point; with 10, a pass has about seven points for each one.
     """
 
-    def __init__(self, neighbours: int = 10) -> None:
-        if neighbours < 1:  # without pairs it would go on for ever
-            raise ValueError(f"neighbours={neighbours}: expected at least 1")
-        self.neighbours = neighbours
+    def __init__(self, neighbors: int = 10) -> None:
+        if neighbors < 1:  # without pairs it would go on for ever
+            raise ValueError(f"neighbors={neighbors}: expected at least 1")
+        self.neighbors = neighbors
 
     def upsample_cloud(self, cloud: Tensor, count: int, context: Context) -> Tensor:
         """cloud (n, 6) -> (count, 6); nothing is random."""
         cloud = cloud.cpu()
         while True:
-            near = knn(cloud[None, :, :3], cloud[None, :, :3], min(self.neighbours + 1, len(cloud))).idx[0]
+            near = knn(cloud[None, :, :3], cloud[None, :, :3], min(self.neighbors + 1, len(cloud))).idx[0]
             here = torch.arange(len(cloud))[:, None].expand_as(near)
             pairs = torch.stack([torch.minimum(here, near), torch.maximum(here, near)], -1).flatten(0, 1)
             pairs = pairs[pairs[:, 0] != pairs[:, 1]].unique(dim=0)

@@ -124,7 +124,7 @@ def predictions(network: nn.Module, cloud: Tensor, batch_size: int | None = None
 
     def work(idx: Tensor) -> Tensor:
         batches = idx.split(size)
-        return torch.cat(threads.spread(predict, batches) if on_cpu else [predict(batch) for batch in batches])
+        return torch.cat(threads.map_on_threads(predict, batches) if on_cpu else [predict(batch) for batch in batches])
 
     return work
 

@@ -17,16 +17,16 @@ class APSS:
     seeds too. Guennebaud and Gross 2007; `pnu.geometry.algebraic_sphere` has the equations.
 
     Args:
-        neighbours: of a sphere fit; few keep detail, many average noise.
+        neighbors: of a sphere fit; few keep detail, many average noise.
         seeds: for each point wanted; half of them, evenly spread, are projected.
-        reach: neighbours of a point that its seeds may lie between.
+        reach: neighbors of a point that its seeds may lie between.
     """
 
-    def __init__(self, neighbours: int = 10, seeds: int = 8, reach: int = 30) -> None:
-        for name, value, least in (("neighbours", neighbours, 4), ("seeds", seeds, 2), ("reach", reach, 2)):
+    def __init__(self, neighbors: int = 10, seeds: int = 8, reach: int = 30) -> None:
+        for name, value, least in (("neighbors", neighbors, 4), ("seeds", seeds, 2), ("reach", reach, 2)):
             if value < least:
                 raise ValueError(f"{name}={value}: expected at least {least}")
-        self.neighbours, self.seeds, self.reach = neighbours, seeds, reach
+        self.neighbors, self.seeds, self.reach = neighbors, seeds, reach
 
     def upsample_cloud(self, cloud: Tensor, count: int, context: Context) -> Tensor:
         """cloud (n, 6) -> (count, 6)."""
@@ -36,7 +36,7 @@ class APSS:
         seeds = seeds[farthest_points_large(seeds, min(len(seeds), self.seeds * count // 2))]
         context.progress("seeds", 1, 1)
         context.progress("projection", 0, 1)
-        projected = apss_project(seeds, cloud, min(self.neighbours, len(cloud)))
+        projected = apss_project(seeds, cloud, min(self.neighbors, len(cloud)))
         context.progress("projection", 1, 1)
         return evenly_spread(projected[_least_moved(seeds, projected, cloud, count)], count, context.progress)
 

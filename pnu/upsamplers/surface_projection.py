@@ -141,7 +141,7 @@ def by_neighbors(
         def batch(part: slice) -> Tensor:
             return project(query[part], cloud, idx[part])
 
-        return torch.cat(threads.spread(batch, batches) if on_cpu else [batch(part) for part in batches])
+        return torch.cat(threads.map_on_threads(batch, batches) if on_cpu else [batch(part) for part in batches])
 
     return work
 
@@ -173,7 +173,7 @@ def seeds_around(cloud: Tensor, each: int, count: int, step: Step = silent) -> T
 def reject_worst(points: Tensor, error: Tensor, count: int) -> Tensor:
     """Indices (count,), ascending, of the points (m, 3) that stay when those of the highest error (m,) are dropped.
 
-    Of neighbours only the worst goes, as long as there are others to drop: a bad point without its surroundings would
+    Of neighbors only the worst goes, as long as there are others to drop: a bad point without its surroundings would
     be a hole.
     """
     surplus = len(points) - count

@@ -108,7 +108,7 @@ def upsample(
 
 
 def attributes(dense: np.ndarray, cloud: Cloud) -> dict[str, np.ndarray]:
-    """Colours and scalars of a cloud at the points of its denser version (m, 6), see `pnu.geometry.attributes`."""
+    """Colors and scalars of a cloud at the points of its denser version (m, 6), see `pnu.geometry.attributes`."""
     if not cloud.attributes:
         return {}
     given = None if cloud.normals is None else torch.from_numpy(cloud.normals)
