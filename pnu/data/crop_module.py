@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from pnu.data import shapes
 from pnu.data.crops import SMALLEST, Crops, WholeClouds, flattened, stacked
-from pnu.data.mesh_scene import Truth
+from pnu.data.mesh_scene import MeshScene
 from pnu.data.patch_module import EpochDataModule, say_open
 from pnu.geometry.mesh_topology import open_edges
 from pnu.io import meshes_of, read_mesh
@@ -42,7 +42,7 @@ class ProjectionDataModule(EpochDataModule):
         self.evaluation_batch_size = 1
         self.root, self.procedural, self.held_out = root, procedural, list(validation)
         self.normals, self.clouds, self.size, self.views, self.points = normals, clouds, size, views, points
-        self.truth: Truth | None = None
+        self.truth: MeshScene | None = None
 
     def setup(self, stage: str | None = None) -> None:
         if self.truth is not None:
@@ -59,7 +59,7 @@ class ProjectionDataModule(EpochDataModule):
         held_out = {name: meshes.pop(name) for name in self.held_out}
         if not meshes:
             raise ValueError(f"data.root={self.root}: expected meshes to train on, found none but those of validation")
-        self.truth = Truth(list(meshes.values()))
+        self.truth = MeshScene(list(meshes.values()))
         self.check_batch_size(self.clouds, f"data.clouds={self.clouds}")
         train = Crops(meshes, self.clouds, size=self.size, views=self.views, normals=self.normals, seed=self.seed)
         clouds = {

@@ -12,7 +12,7 @@ from pnu.io import Mesh
 APART = 3.0  # between meshes of the unit sphere
 
 
-class Truth:
+class MeshScene:
     """Meshes of the unit sphere, set side by side in one ray casting scene. Needs open3d; single precision."""
 
     def __init__(self, meshes: Sequence[Mesh]) -> None:

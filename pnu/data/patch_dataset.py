@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
 from pnu.data.augment import Augmentation
-from pnu.data.patch_file import check
+from pnu.data.patch_file import check_patch_file
 from pnu.geometry.grouping import gather
 from pnu.geometry.sampling import nonuniform_points, poisson_disk_points, random_points
 from pnu.geometry.unit_sphere import unit_sphere_frame
@@ -189,7 +189,7 @@ def split(names: Sequence[str] | None, patches: int, *, val: float, test: float,
 
 def check_options(path: str | Path, options: Options) -> None:
     """ValueError where a file cannot give such samples."""
-    contents = check(path)
+    contents = check_patch_file(path)
     if options.downsampling not in get_args(Downsampling):
         raise ValueError(
             f"data.downsampling: expected {', '.join(get_args(Downsampling))}, found {options.downsampling!r}"

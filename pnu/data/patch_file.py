@@ -70,7 +70,7 @@ def edges_of(patch: np.ndarray, sharp: np.ndarray, rng: np.random.Generator) -> 
     return chosen
 
 
-def build(
+def cut_patch_file(
     path: str | Path,
     shapes: Mapping[str, Callable[[], Mesh]],
     patches: int,
@@ -175,7 +175,7 @@ class Contents(NamedTuple):
     open_edges: dict[str, int] | None  # of the mesh of each shape; None where the file does not tell
 
 
-def check(path: str | Path) -> Contents:
+def check_patch_file(path: str | Path) -> Contents:
     """What a patch file holds; every patch of it is looked at, once in a process while the file stays as it is.
 
     Raises:
@@ -356,7 +356,7 @@ def names_of(path: Path, file: h5py.File, patches: int) -> list[str] | None:
 
 def describe(path: str | Path) -> dict[str, Any]:
     """Figures of a patch file: its datasets, shapes, spacing and extent of patches, range of coordinates, normals."""
-    contents = check(path)
+    contents = check_patch_file(path)
     with opened(Path(path)) as file:
         clouds = file["poisson_4096"]
         sample = clouds[:: -(-len(clouds) // 32)].astype(float)

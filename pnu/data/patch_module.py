@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader, Dataset, Subset
 from pnu.data import shapes
 from pnu.data.augment import Augmentation, from_options
 from pnu.data.patch_dataset import Downsampling, EpochSampler, Options, PatchDataset, check_options, split
-from pnu.data.patch_file import build, check, told_open
+from pnu.data.patch_file import check_patch_file, cut_patch_file, told_open
 from pnu.io import Mesh, meshes_of, read_mesh
 from pnu.runtime.progress import counted
 
@@ -163,7 +163,7 @@ class PatchDataModule(EpochDataModule):
         self.file = self.patch_file()
         check_options(self.file, self.options)
         check_options(self.file, self.evaluation)
-        contents = check(self.file)
+        contents = check_patch_file(self.file)
         if contents.names is None:
             say(f"{self.file} has no shape names: validation and test are its last blocks of consecutive patches")
         self.names = contents.names
@@ -215,11 +215,11 @@ class GeneratedDataModule(PatchDataModule):
             makers = self.makers()
             cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
             processes = min(cores, 8, 1 + len(makers) // 8)  # to start one takes as long as several shapes
-            build(
+            cut_patch_file(
                 path, makers, self.patches, seed=self.shape_seed, parameters=parameters, processes=processes,
                 progress=None if self.quiet else functools.partial(counted, description=f"cut patches into {path}"),
             )  # fmt: skip
-            say_open(check(path).open_edges or {})
+            say_open(check_patch_file(path).open_edges or {})
         return path
 
 
