@@ -118,7 +118,7 @@ def test_the_search_for_commands_finds_them(tmp_path: Path) -> None:
 # where a line is made -> the test below that runs it
 PLACES = {
     "commands/prepare.py next_line": "test_from_patches_to_a_picture",
-    "training/result_table.py closing": "test_from_patches_to_a_picture",
+    "training/run_folder.py line": "test_from_patches_to_a_picture",
     "commands/upsample.py upsample": "test_from_patches_to_a_picture",
     "commands/reconstruct.py reconstruct": "test_from_patches_to_a_picture",
     "commands/export.py export": "test_weights_kept_as_a_file",
