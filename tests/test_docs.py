@@ -151,7 +151,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_blocks_run_in_order(page: str, cache: Path, tmp_path: Path) -> None:
     lay_out(tmp_path, cache)
     for language, block in BLOCK.findall(text(page)):
-        named = re.match(r"# ((?:pnu|conf)/\S+)\n", block)
+        named = re.match(r"# ((?:pnu/|conf/|mylab)\S+)\n", block)
         if named:
             (tmp_path / named[1]).write_text(block, encoding="utf-8")
         elif language == "python":

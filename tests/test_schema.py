@@ -1,5 +1,6 @@
 """The keys of conf/ are the arguments of classes, read from their source."""
 
+import os
 import re
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from omegaconf import OmegaConf
 
 from pnu.commands.train import Train
 from pnu.config.compose import compose_config, config_folder
-from pnu.config.help_text import help_text
+from pnu.config.help_text import help_text, reference
 from pnu.config.schema import class_arguments, convert, library, settable, targets, type_name
 from pnu.config.signature import REQUIRED, Class, arguments, described, summary
 
@@ -274,3 +275,10 @@ def test_help_and_mistakes_import_nothing_heavy(verb: str) -> None:
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
     assert "unknown key 'epochs'" in done.stderr
+
+
+def test_the_page_of_keys_has_the_words_of_the_constructors() -> None:
+    page = config_folder().parent / "docs" / "config.md"
+    if os.environ.get("PNU_WRITE"):
+        page.write_text(reference(), encoding="utf-8")
+    assert page.read_text(encoding="utf-8") == reference(), "PNU_WRITE=1 python -m pytest tests/test_schema.py"

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from pnu.config.compose import group_choices
+from pnu.config.instantiate import PACKAGES
 from pnu.config.schema import Groups, class_arguments, fields, groups, library, nested_class, settable
 from pnu.config.signature import Argument, arguments, summary
 
@@ -70,3 +71,34 @@ def group_lines(content: Any, group: str, prefix: str, allow: Any) -> Iterator[s
 
 def line(key: str, value: Any, words: str) -> str:
     return f"  {key + '=' + (value if value == '...' else shown(value)):<40} {words}".rstrip()
+
+
+def reference() -> str:
+    """docs/config.md: the arguments of every class that conf/ names, as `--help` has them."""
+    import yaml
+
+    from pnu.run.schema import config_folder, targets, type_name
+    from pnu.run.signature import REQUIRED, UNREADABLE
+
+    lines = [
+        "# The keys of conf/",
+        "",
+        "Each group's keys are the arguments of the class that it names, with the words of its constructor; of classes",
+        "of libraries those that conf/ sets, and every other may be given too. `PNU_WRITE=1 python -m pytest",
+        "tests/test_schema.py` writes this page.",
+    ]
+    for group in sorted(path.name for path in config_folder().iterdir() if path.is_dir()):
+        for choice, named in targets(group).items() if group in PACKAGES else ():
+            content = yaml.safe_load((config_folder() / group / f"{choice}.yaml").read_text(encoding="utf-8"))
+            for name, target in named.items():
+                prefix = f"{group}.{name}." if name else f"{group}."
+                known = dict(settable(group, class_arguments(group, target)))
+                here = content[name] if name else content
+                lines += ["", f"## {group}={choice}: `{target}`", "", "| key | type | value | |", "|---|---|---|---|"]
+                for key, argument in known.items():
+                    if library(target) and key not in here:
+                        continue
+                    value = here.get(key, argument.default)
+                    text = "" if value is REQUIRED or value is UNREADABLE else f"`{shown(value)}`"
+                    lines.append(f"| `{prefix}{key}` | {type_name(argument.hint)} | {text} | {argument.words} |")
+    return "\n".join(lines) + "\n"

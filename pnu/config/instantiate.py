@@ -26,6 +26,7 @@ GIVEN = {  # arguments that the program gives, and why a config cannot
     "trainer": {
         "callbacks": "are a group of their own: callbacks=[default,ema], +callbacks.NAME._target_=CLASS",
         "logger": "is a group of its own: logger=csv, logger=[tensorboard,csv], logger=none",
+        "barebones": "leaves out what a run folder is made of: curves, checkpoints, validation",
         "plugins": "are objects, which a config cannot hold; those that pnu needs are there",
         "default_root_dir": "is the run folder, run=FOLDER",
         "enable_checkpointing": "pnu writes its own: callbacks.checkpoints.every_n_steps=N, ~callbacks.checkpoints",
