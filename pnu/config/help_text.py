@@ -77,8 +77,8 @@ def reference() -> str:
     """docs/config.md: the arguments of every class that conf/ names, as `--help` has them."""
     import yaml
 
-    from pnu.run.schema import config_folder, targets, type_name
-    from pnu.run.signature import REQUIRED, UNREADABLE
+    from pnu.config.schema import config_folder, targets, type_name
+    from pnu.config.signature import REQUIRED, UNREADABLE
 
     lines = [
         "# The keys of conf/",
