@@ -112,7 +112,7 @@ COMMANDS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMMANDS)
 def test_commands(name: str, place: Path) -> None:
-    line = ["-m", f"pnu.{name}", *COMMANDS[name], "quiet=true"]
+    line = ["-m", f"pnu.commands.{name}", *COMMANDS[name], "quiet=true"]
     filler = fill(place, 0)
     before = listing(place)
     refused(command(place, *line), "No space left on device")

@@ -112,6 +112,9 @@ def test_commands_take_an_own_network(mylab: Path) -> None:
     ):
         verb, *words = line.split()
         done = subprocess.run(
-            [sys.executable, "-m", f"pnu.{verb}", *words, "allow=[mylab]"], capture_output=True, text=True, check=False
+            [sys.executable, "-m", "pnu", verb, *words, "allow=[mylab]"],
+            capture_output=True,
+            text=True,
+            check=False,
         )
         assert done.returncode == 0, done.stderr

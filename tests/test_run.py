@@ -26,7 +26,7 @@ GROUPS = sorted(path.name for path in config_folder().iterdir() if path.is_dir()
 
 
 def schema_of(name: str) -> type:
-    return importlib.import_module(f"pnu.{name}").main.schema
+    return importlib.import_module(f"pnu.commands.{name}").main.schema
 
 
 # --- every key has a line of documentation ---
@@ -429,6 +429,6 @@ def test_metrics_are_put_together(tmp_path: Path) -> None:
 
 
 def test_a_reader_that_goes_is_no_error() -> None:
-    command = f"{sys.executable} -m pnu.upsample --help | true"
+    command = f"{sys.executable} -m pnu upsample --help | true"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=True, timeout=60)
     assert done.stderr == ""

@@ -265,7 +265,7 @@ def test_help_says_the_words_of_the_constructors() -> None:
 def test_help_and_mistakes_import_nothing_heavy(verb: str) -> None:
     code = f"""
         import sys
-        from pnu.{verb} import main
+        from pnu.commands.{verb} import main
         main(["--help"])
         try:
             main(["epochs=3"])

@@ -30,7 +30,7 @@ Moment = Callable[[Path], bool]
 def start(folder: Path, module: str, *arguments: str) -> subprocess.Popen[bytes]:
     """A command in a session of its own, so that what it leaves running can be found."""
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", f"pnu.{module}", *arguments]
+    command = [sys.executable, "-m", f"pnu.commands.{module}", *arguments]
     with (folder / "log").open("ab") as log:
         return subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=log, start_new_session=True)
 

@@ -5,13 +5,13 @@ import shlex
 import shutil
 import subprocess
 import sys
-import tomllib
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pnu.__main__ import verbs
 from pnu.data import shapes
 from pnu.geometry.mesh_sampling import sample_area
 from pnu.io import read_cloud, write_cloud, write_mesh
@@ -19,19 +19,18 @@ from pnu.runtime.system_libraries import open3d_error
 from tests.test_docs import SHORT, released_checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]
-SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 ALL_HELP = """
 import contextlib, importlib.metadata, io, pathlib, sys, pnu
-site = sys.argv[1]
-(found,) = importlib.metadata.distributions(name="pnu", path=[site])
-scripts = [entry for entry in found.entry_points if entry.group == "console_scripts"]
+from pnu.__main__ import verbs
+(found,) = importlib.metadata.distributions(name="pnu", path=[sys.argv[1]])
+(script,) = [entry for entry in found.entry_points if entry.group == "console_scripts"]
+assert script.name == "pnu"
 print(pathlib.Path(pnu.__file__).parent)
-for script in scripts:
-    sys.argv = [script.name, "--help"]
+for verb in set(verbs()) - {"doctor"}:  # which has no keys
     with contextlib.redirect_stdout(io.StringIO()) as said:
-        script.load()()
-    assert "quiet" in said.getvalue() and script.name in said.getvalue(), said.getvalue()
-    print(script.name)
+        script.load()([verb, "--help"])
+    assert "quiet" in said.getvalue() and f"usage: pnu {verb}" in said.getvalue(), said.getvalue()
+    print(verb)
 """
 
 
@@ -72,21 +71,16 @@ def test_the_wheel_holds_what_the_package_reads(wheel: Path) -> None:
     wanted = {f"pnu/{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "conf").rglob("*.yaml")}
     files = [path for path in (ROOT / "pnu").rglob("*") if path.is_file() and "__pycache__" not in path.parts]
     wanted |= {path.relative_to(ROOT).as_posix() for path in files}
-    assert {"pnu/conf/train.yaml", "pnu/py.typed", "pnu/weights/surface.safetensors", "pnu/page/base.html"} <= wanted
+    assert {"pnu/conf/train.yaml", "pnu/py.typed", "pnu/weights/surface.safetensors", "pnu/report/base.html"} <= wanted
     assert wanted - packed == set()
     assert any(name.endswith("licenses/LICENSE") for name in packed)
     assert {name.split("/")[0].partition("-")[0] for name in packed} == {"pnu"}
 
 
-def test_every_command_has_a_script() -> None:
-    commands = {path.stem for path in (ROOT / "pnu").glob("*.py") if "main = command(" in path.read_text()}
-    assert {f"pnu-{name}": f"pnu.{name}:main" for name in commands} == SCRIPTS
-
-
-def test_every_script_answers_from_another_directory(site: Path, tmp_path: Path) -> None:
+def test_every_verb_answers_from_another_directory(site: Path, tmp_path: Path) -> None:
     package, *answered = run(site, tmp_path, sys.executable, "-c", ALL_HELP, site).split()
     assert Path(package) == site / "pnu"
-    assert set(answered) == set(SCRIPTS)
+    assert set(answered) == set(verbs()) - {"doctor"}
     assert list(tmp_path.iterdir()) == []
 
 
@@ -94,15 +88,15 @@ def test_an_installed_script_upsamples_with_the_shipped_weights(site: Path, tmp_
     points = np.random.default_rng(0).normal(size=(200, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     np.savetxt(tmp_path / "sphere.xyz", np.hstack([points, points]))
-    script = site / "bin" / "pnu-upsample"
-    run(site, tmp_path, script, "input=sphere.xyz", "output=dense.xyz", "run=surface", "ratio=2", "quiet=true")
+    keys = ["input=sphere.xyz", "output=dense.xyz", "run=surface", "ratio=2", "quiet=true"]
+    run(site, tmp_path, site / "bin" / "pnu", "upsample", *keys)
     dense = np.loadtxt(tmp_path / "dense.xyz")
     assert dense.shape == (400, 6)
     assert np.abs(np.linalg.norm(dense[:, :3], axis=1) - 1).max() < 0.1
 
 
 @pytest.mark.slow
-def test_every_script_does_its_work_in_another_directory(site: Path, tmp_path: Path) -> None:
+def test_every_verb_does_its_work_in_another_directory(site: Path, tmp_path: Path) -> None:
     """From a scan and meshes to patches, networks, clouds, tables and pictures."""
     mug = shapes.make("mug")
     scan = sample_area(mug, 400, np.random.default_rng(0))
@@ -112,27 +106,27 @@ def test_every_script_does_its_work_in_another_directory(site: Path, tmp_path: P
         write_mesh(tmp_path / "meshes" / f"{name}.ply", shapes.make(name))
     released_checkpoint(tmp_path / "epoch_1.pt")
     measured = "shapes=[mug] kinds=[uniform] points=300 truth_points=1200 data=meshes data.root=meshes"
-    trained = f"data=patches data.path=patches.h5 {' '.join(SHORT['pnu.train'][1:])}"
+    trained = f"data=patches data.path=patches.h5 {' '.join(SHORT['train'][1:])}"
     lines = [
-        "pnu-prepare data=meshes data.root=meshes data.patches=12 output=patches.h5",
-        f"pnu-train run=run {trained}",
-        f"pnu-train -m loss.w3=0,0.05 sweep=s {trained}",
-        "pnu-report sweep=outputs/sweeps/s",
-        f"pnu-evaluate run=run {measured}",
-        f"pnu-compare methods=[run,midpoint] surfaces=[] size=64 output=page {measured}",
-        "pnu-export run=run output=mine.safetensors",
-        "pnu-convert input=epoch_1.pt output=converted",
-        "pnu-upsample input=scan.ply output=dense.ply run=mine.safetensors",
-        "pnu-picture inputs=[scan.ply,dense.ply] output=figure.png size=64",
+        "pnu prepare data=meshes data.root=meshes data.patches=12 output=patches.h5",
+        f"pnu train run=run {trained}",
+        f"pnu train -m loss.w3=0,0.05 sweep=s {trained}",
+        "pnu report sweep=outputs/sweeps/s",
+        f"pnu evaluate run=run {measured}",
+        f"pnu compare methods=[run,midpoint] surfaces=[] size=64 output=page {measured}",
+        "pnu export run=run output=mine.safetensors",
+        "pnu convert input=epoch_1.pt output=converted",
+        "pnu upsample input=scan.ply output=dense.ply run=mine.safetensors",
+        "pnu picture inputs=[scan.ply,dense.ply] output=figure.png size=64",
     ]
     made = "patches.h5 run/metrics.json outputs/sweeps/s/report/report.md run/evaluation page/index.html converted"
     if not open3d_error():
-        lines.append("pnu-reconstruct input=scan.ply output=mesh.ply")
+        lines.append("pnu reconstruct input=scan.ply output=mesh.ply")
         made += " mesh.ply"
     for line in lines:
         script, *arguments = shlex.split(line)
         run(site, tmp_path, site / "bin" / script, *arguments)
-    assert {line.split()[0] for line in lines} | {"pnu-reconstruct"} == set(SCRIPTS)
+    assert {line.split()[1] for line in lines} | {"reconstruct", "doctor"} == set(verbs())
     assert len(read_cloud(tmp_path / "dense.ply").points) == 1600
     for path in [*made.split(), "figure.png"]:
         assert (tmp_path / path).exists(), path
