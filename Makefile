@@ -7,7 +7,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup check test nightly coverage train sweep board bench clean
+.PHONY: help setup check test nightly coverage train sweep board bench docs clean
 
 help:   ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -50,6 +50,9 @@ board: $(STAMP)   ## TensorBoard over outputs/
 
 bench: $(STAMP)   ## measure speed, as ratios to named alternatives
 	$(BIN)/python -m bench $(ARGS)
+
+docs: $(STAMP)   ## the documentation as a site, in build/docs; a warning is an error
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
 clean:   ## remove caches and the virtual environment; data/ and outputs/ stay
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist *.egg-info

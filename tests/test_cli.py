@@ -170,9 +170,7 @@ def test_interrupted_by_hand(tmp_path: Path, small: list[str]) -> None:
     _, err = process.communicate(timeout=300)
     assert process.returncode == 130
     assert "Traceback" not in err
-    assert (
-        err.strip().splitlines()[-1] == f"stopped; go on with: python -m pnu.train resume=true run={tmp_path / 'run'}"
-    )
+    assert err.strip().splitlines()[-1] == f"stopped; go on with: pnu train resume=true run={tmp_path / 'run'}"
     assert json.loads((tmp_path / "run/run.json").read_text())["error"] == "interrupted"
 
 

@@ -26,7 +26,7 @@ from pnu.runtime.system_libraries import open3d_error
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("docs/**/*.md"))
-PAGES += ["README.md", "data/README.md", "SECURITY.md"]
+PAGES += ["README.md", "data/README.md", "SECURITY.md", "CONTRIBUTING.md"]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.M | re.S)
 WITH_BLOCKS = [page for page in PAGES if BLOCK.search((ROOT / page).read_text(encoding="utf-8"))]
 SHORT = {
@@ -153,6 +153,7 @@ def test_blocks_run_in_order(page: str, cache: Path, tmp_path: Path) -> None:
     for language, block in BLOCK.findall(text(page)):
         named = re.match(r"# ((?:pnu/|conf/|mylab)\S+)\n", block)
         if named:
+            (tmp_path / named[1]).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / named[1]).write_text(block, encoding="utf-8")
         elif language == "python":
             run(tmp_path, [sys.executable, "-c", PRELUDE + filled(tmp_path, block)])

@@ -87,6 +87,7 @@ def files_imported(path: Path, names: Collection[str]) -> set[str]:
 
 def test_no_file_imports_itself_on_a_round_way() -> None:
     names = modules()
+    del names["pnu"]  # names its public functions for type checkers, and all may ask for its version
     graph = {module: files_imported(path, names) - {module} for module, path in names.items()}
     TopologicalSorter(graph).prepare()
     with pytest.raises(CycleError):

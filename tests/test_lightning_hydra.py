@@ -190,11 +190,11 @@ def initial(run: Path) -> dict[str, torch.Tensor]:
     """The network of a run before its first step."""
     import lightning.pytorch as pl
 
-    from pnu import models
+    from pnu.networks import build_network
 
     config = yaml.safe_load((run / "config.yaml").read_text())
     pl.seed_everything(config["seed"], verbose=False)
-    return models.build(config["model"]).state_dict()
+    return build_network(config["model"]).state_dict()
 
 
 def test_a_run_with_an_average_goes_on_as_if_never_stopped(train: Any) -> None:

@@ -86,7 +86,7 @@ def test_the_next_line_is_a_training_that_the_file_is_fit_for(
     path = patches(tmp_path / "patches.h5", *made)
     main([f"describe={path}"])
     line = capsys.readouterr().out.splitlines()[-1]
-    assert line == f"next: python -m pnu.train data=patches data.path={path}{options}"
+    assert line == f"next: pnu train data=patches data.path={path}{options}"
     arguments = dict(word.removeprefix("data.").split("=") for word in line.split()[4:])
     numbers = {name: int(value) for name, value in arguments.items() if value.isdigit()}
     PatchDataModule(str(path), **numbers).setup()  # type: ignore[arg-type]

@@ -374,7 +374,7 @@ def test_an_interruption_tells_how_to_go_on(
         raise stop
     assert ended.value.code == 130
     assert run.read_record()["error"] == "interrupted"
-    assert capsys.readouterr().err == f"stopped; go on with: python -m pnu.train resume=true run={run}\n"
+    assert capsys.readouterr().err == f"stopped; go on with: pnu train resume=true run={run}\n"
     job = RunFolder.create({**CONFIG, "run": str(tmp_path / "job")})
     job.facts = {"job": 0}
     with pytest.raises(SystemExit), job.recorded(CONFIG):

@@ -371,7 +371,7 @@ def test_a_finished_run_without_its_last_checkpoint_is_kept(train: Train, capsys
     run = train("trainer.max_steps=2", "trainer.val_check_interval=2")
     (run / "checkpoints/last.ckpt").unlink()
     error = refused(capsys, main, [f"run={run}", "resume=true"])
-    assert f"has no last.ckpt to go on from; python -m pnu.train weights={run} starts from it" in error
+    assert f"has no last.ckpt to go on from; pnu train weights={run} starts from it" in error
     assert (run / "checkpoints/best.ckpt").exists()
     assert record(run)["status"] == "finished"
 

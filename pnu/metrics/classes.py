@@ -197,8 +197,10 @@ class EarthMoverDistance(CloudMean):
 class CloudMetrics(CloudMean):
     """All metrics of two clouds from one search, see `pnu.metrics.metric`: what training logs.
 
-    Args: normals: whether prediction and target have normals whose error is wanted. metrics: those to choose from; what
-        is for whole clouds, or needs a mesh, is left out.
+    Args:
+        normals: whether prediction and target have normals whose error is wanted.
+        metrics: those to choose from; what is for whole clouds, or needs a mesh, is left out.
+
     Update: prediction (B, n, 6), target (B, m, 6); 3 columns will do without `normals`.
     Compute: dict of 0-d tensors, means over clouds, by name.
 

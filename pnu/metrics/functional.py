@@ -252,8 +252,8 @@ def _as_pair(prediction: Tensor | ArrayLike | Pair, target: Tensor | ArrayLike |
 def mean_update(values: Tensor) -> tuple[Tensor, Tensor]:
     """Sum and count of one value a cloud; add them over batches and processes.
 
-    >>> [float(x) for x in mean_update(torch.tensor([1.0, 2.0]))]
-    [3.0, 2.0]
+    >>> tuple(float(x) for x in mean_update(torch.tensor([1.0, 2.0])))
+    (3.0, 2.0)
     """
     return values.sum(0), torch.tensor(float(values.shape[0]), device=values.device)
 

@@ -214,6 +214,7 @@ class ProgressBar(pl.Callback):
             TimeElapsedColumn(),
             TextColumn("left"),
             TimeRemainingColumn(),
+            unseen=False,
         )
         step = trainer.global_step
         self.task = self.bar.add_task(
