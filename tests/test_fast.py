@@ -18,7 +18,7 @@ import pnu.losses
 from pnu import networks
 from pnu.fast import FORMS, accelerate, accelerated, cache, forms
 from pnu.fast.forms import through
-from pnu.fast.groups import Groups, distinct, single, whole
+from pnu.fast.neighborhoods import Groups, distinct, single, whole
 from pnu.losses import CompoundLoss
 from pnu.networks.layers import MLP, Abstraction, JoinedMLP, PooledMLP, Propagation
 from pnu.networks.norm import synchronize

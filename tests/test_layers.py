@@ -1,9 +1,10 @@
 """The house: imports point one way, and `import pnu` stays light."""
 
 import ast
+import re
 import subprocess
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -73,6 +74,26 @@ def test_upward_import_is_found(tmp_path: Path) -> None:
     culprit.write_text("def f():\n    from pnu.geometry import nearest\n")
     names = modules() | {"pnu.io": culprit}
     assert "pnu.io imports pnu.geometry" in violations(names)
+
+
+ENDING = re.compile(r"(ing|ions|ion|ers|er|ed|es|s|e)$")
+
+
+def alike(names: Iterable[str]) -> list[set[str]]:
+    """Names that are equal, or differ by an ending only."""
+    found: dict[str, set[str]] = {}
+    for name in names:
+        found.setdefault(ENDING.sub("", name.strip("_")), set()).add(name)
+    return [group for group in found.values() if len(group) > 1]
+
+
+def test_no_two_names_of_files_differ_by_an_ending_only() -> None:
+    paths = [path for path in PACKAGE.rglob("*.py") if not path.stem.startswith("__")]
+    inner = [path.stem for path in paths if path.parent != PACKAGE and path.parent.name != "commands"]
+    assert len(inner) == len(set(inner))
+    rooms = [path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name != "__pycache__"]
+    assert alike([*inner, *rooms]) == []
+    assert alike(["picture", "pictures", "render"]) == [{"picture", "pictures"}]
 
 
 def files_imported(path: Path, names: Collection[str]) -> set[str]:

@@ -8,7 +8,7 @@ from pnu.commands._entry import command
 from pnu.config.instantiate import PACKAGES, find_metric, instantiate
 from pnu.config.schema import Group, Groups, doc
 from pnu.runtime.provenance import machine
-from pnu.training.result_table import closing, job_line, objective
+from pnu.training.closing_lines import closing, job_line, objective
 from pnu.training.resuming import open_run
 from pnu.training.run_folder import is_main_process
 

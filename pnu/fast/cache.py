@@ -6,7 +6,7 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from pnu.fast.groups import Groups
+from pnu.fast.neighborhoods import Groups
 from pnu.runtime import threads
 
 CHUNK = 2**17  # floats in the widest matrix of a chunk: 512 KiB, a handful of which fit the cache of a core

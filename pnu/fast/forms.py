@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from pnu.fast import stack
 from pnu.fast.combine import combine
-from pnu.fast.groups import Groups, distinct, pool, single, whole
+from pnu.fast.neighborhoods import Groups, distinct, pool, single, whole
 from pnu.geometry.grouping import gather
 from pnu.geometry.neighbor_search import ball_query, knn
 from pnu.networks import layers, pugeo

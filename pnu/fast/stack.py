@@ -28,7 +28,7 @@ from torch.autograd.function import once_differentiable
 
 from pnu.fast.cache import Chunk, Scratch, group_chunks, map_chunks, row_chunks
 from pnu.fast.combine import scatter
-from pnu.fast.groups import Groups, ungroup
+from pnu.fast.neighborhoods import Groups, ungroup
 from pnu.networks.layers import Layer
 from pnu.networks.norm import BatchNorm, check_rows, everywhere
 

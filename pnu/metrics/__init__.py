@@ -5,6 +5,7 @@ The functions need no torchmetrics; the classes are imported on first use, since
 
 from typing import TYPE_CHECKING, Any
 
+from pnu.metrics.declared import METRICS, Metric, Shown, compare, compare_mesh, measured, with_own
 from pnu.metrics.functional import (
     NormalErrors,
     Pair,
@@ -19,7 +20,6 @@ from pnu.metrics.functional import (
     spacing_cv,
     uniformity,
 )
-from pnu.metrics.metric import METRICS, Metric, Shown, compare, compare_mesh, measured, with_own
 
 if TYPE_CHECKING:
     from pnu.metrics.classes import (

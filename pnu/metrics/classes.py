@@ -12,7 +12,7 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from pnu.io import Mesh
-from pnu.metrics import functional, metric
+from pnu.metrics import declared, functional
 from pnu.metrics.functional import mean_compute, mean_update
 
 
@@ -195,7 +195,7 @@ class EarthMoverDistance(CloudMean):
 
 
 class CloudMetrics(CloudMean):
-    """All metrics of two clouds from one search, see `pnu.metrics.metric`: what training logs.
+    """All metrics of two clouds from one search, see `pnu.metrics.declared`: what training logs.
 
     Args:
         normals: whether prediction and target have normals whose error is wanted.
@@ -211,7 +211,9 @@ class CloudMetrics(CloudMean):
         {'chamfer_sq': tensor(0.5000), 'hausdorff_sq': tensor(1.), 'spacing_cv': tensor(0.)}
     """
 
-    def __init__(self, normals: bool = True, metrics: Sequence[metric.Metric] = metric.METRICS, **kwargs: Any) -> None:
+    def __init__(
+        self, normals: bool = True, metrics: Sequence[declared.Metric] = declared.METRICS, **kwargs: Any
+    ) -> None:
         if not isinstance(normals, bool):
             raise ValueError(f"normals: expected True or False, found {normals!r}")
         has = {"target", "normals"} if normals else {"target"}
@@ -220,7 +222,7 @@ class CloudMetrics(CloudMean):
         self.metrics, self.names = chosen, tuple(one.shown.name for one in chosen)
 
     def update(self, prediction: Tensor, target: Tensor) -> None:
-        values = metric.measured(functional.Pair(prediction, target), self.metrics)
+        values = declared.measured(functional.Pair(prediction, target), self.metrics)
         if len(values) < len(self.names):
             raise ValueError(
                 f"prediction, target: expected 6 columns for the normals' error, found {prediction.shape[-1]}"

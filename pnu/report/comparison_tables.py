@@ -8,7 +8,7 @@ import numpy as np
 from pnu.benchmark import Row, columns, summarize
 from pnu.benchmark.result_tables import REFERENCES, counts
 from pnu.metrics import METRICS, Metric, Shown
-from pnu.metrics.metric import ChamferSq, HausdorffSq
+from pnu.metrics.declared import ChamferSq, HausdorffSq
 from pnu.report import offline_page
 
 ACROSS = 6  # shapes in a table, twice: more do not fit a window of 1400 pixels

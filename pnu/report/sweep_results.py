@@ -11,7 +11,7 @@ import yaml
 from pnu.config.compose import flatten
 from pnu.config.quoting import shell_line
 from pnu.io import read_json
-from pnu.training.result_table import described, shown_in
+from pnu.training.closing_lines import described, shown_in
 from pnu.training.run_folder import UNHASHED, UNHASHED_DATA, RunFolder
 from pnu.training.sweeps import runs
 
