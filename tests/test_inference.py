@@ -87,7 +87,7 @@ def test_pass_sizes_never_outgrow_the_network() -> None:
 
 
 def test_patches_arrive_as_in_training() -> None:
-    """Centerd, of radius 1, with unit normals, in float32, of the network's size."""
+    """Centered, of radius 1, with unit normals, in float32, of the network's size."""
     network = Spread()
     upsample(700 * sphere(2000) + 1e5, sphere(2000), model=network, batch_size=3)
     patches = torch.cat(network.seen)

@@ -96,6 +96,20 @@ def test_no_two_names_of_files_differ_by_an_ending_only() -> None:
     assert alike(["picture", "pictures", "render"]) == [{"picture", "pictures"}]
 
 
+def undocumented(path: Path) -> list[str]:
+    """Public functions and classes of a file without a docstring."""
+    kinds = ast.FunctionDef | ast.ClassDef
+    found = (node for node in ast.parse(path.read_text()).body if isinstance(node, kinds))
+    return [node.name for node in found if not node.name.startswith("_") and ast.get_docstring(node) is None]
+
+
+def test_every_public_definition_says_what_it_is(tmp_path: Path) -> None:
+    assert {module: found for module, path in modules().items() if (found := undocumented(path))} == {}
+    silent = tmp_path / "a.py"
+    silent.write_text("def f(): ...\n\n\ndef _g(): ...\n\n\nclass C:\n    'Said.'\n")
+    assert undocumented(silent) == ["f"]
+
+
 def files_imported(path: Path, names: Collection[str]) -> set[str]:
     """The files behind the imports of a file, those for type checkers too."""
     found = set()

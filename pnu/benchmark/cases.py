@@ -123,6 +123,7 @@ def pair_cases(
 
 
 def read_truth(folder: Path, shape: str, count: int, seed: int, warn: Warn) -> tuple[Truth, Frame]:
+    """The true surface of a shape in a folder of pairs: its mesh, or samples of it."""
     meshes = [path for path in files_of(folder, MESH_SUFFIXES) if path.stem == shape]
     samples = samples_path(folder, shape, count, warn)
     if not meshes and samples is None:
@@ -214,6 +215,7 @@ def frame_of(samples: np.ndarray, mesh: Mesh | None) -> tuple[Frame, str]:
 
 
 def radius(points: np.ndarray) -> float:
+    """Largest distance from the origin."""
     return float(np.linalg.norm(points, axis=1).max())
 
 
@@ -223,8 +225,10 @@ def centroid(mesh: Mesh) -> np.ndarray:
 
 
 def moved(cloud: np.ndarray, frame: Frame) -> np.ndarray:
+    """A cloud (n, 6) brought into a frame; normals stay."""
     return frame.to_unit(torch.from_numpy(cloud[None].astype(np.float64)))[0].numpy()
 
 
 def moved_mesh(mesh: Mesh, frame: Frame) -> Mesh:
+    """A mesh brought into a frame."""
     return Mesh(moved(mesh.vertices, frame), mesh.faces)

@@ -78,6 +78,7 @@ def measure(
 
 
 def normals_of(case: Case) -> np.ndarray:
+    """The normals of a case's input, or None where it has none."""
     given = None if case.normals is None else torch.from_numpy(case.normals)
     return complete_normals(torch.from_numpy(case.points), given).numpy()
 

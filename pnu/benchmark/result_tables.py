@@ -92,6 +92,7 @@ def counts(rows: Sequence[Row]) -> str:
 
 
 def cell(row: Mapping[str, Any], shown: Shown) -> str:
+    """A value of a row as its table shows it."""
     return shown.text(row.get(shown.name))
 
 

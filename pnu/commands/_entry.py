@@ -161,6 +161,7 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
 
 
 def hydras_own(overrides: Sequence[str]) -> list[str]:
+    """The overrides of Hydra's own keys."""
     return [override for override in overrides if override.startswith("hydra.")]
 
 
@@ -192,6 +193,7 @@ def folder_arguments(config: Any, schema: type) -> list[str]:
 
 
 def is_override(argument: str) -> bool:
+    """Whether an argument sets a key, and is no option."""
     return not argument.startswith("-") and ("=" in argument or argument.startswith("~"))
 
 
@@ -209,6 +211,7 @@ def renamed(argument: str, names: Mapping[str, str], commas: Sequence[str] = ())
 
 
 def stop(error: Exception) -> typing.NoReturn:
+    """End the program: one line on stderr, exit code 2."""
     if isinstance(error, BrokenPipeError):  # the reader of the output has gone, as in `... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
@@ -217,11 +220,13 @@ def stop(error: Exception) -> typing.NoReturn:
 
 
 def full_errors() -> bool:
+    """Whether tracebacks are wanted, HYDRA_FULL_ERROR=1."""
     return os.environ.get("HYDRA_FULL_ERROR") == "1"
 
 
 @contextmanager
 def replaced_argv(arguments: list[str]) -> Iterator[None]:
+    """`sys.argv` with other arguments, for a while: Hydra reads them there."""
     before, sys.argv = sys.argv, [sys.argv[0], *arguments]
     try:
         yield

@@ -56,6 +56,7 @@ class Compare:
 
 
 def compare(cfg: Any) -> None:
+    """Run the methods on the shapes and write the page."""
     check_options(cfg)
     from pnu import benchmark, metrics
     from pnu.report import comparison_page
@@ -198,6 +199,7 @@ def check_options(cfg: Any) -> None:
 
 
 def warn(text: str) -> None:
+    """A line on stderr."""
     print(f"warning: {text}", file=sys.stderr)
 
 

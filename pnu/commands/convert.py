@@ -19,6 +19,7 @@ class Convert:
 
 
 def convert(cfg: Any) -> None:
+    """Write a run folder from a checkpoint of the released code."""
     output = Path(cfg.output)
     if not Path(cfg.input).is_file():
         raise ValueError(f"input={cfg.input}: no such file; expected a checkpoint epoch_N.pt of the released code")

@@ -53,6 +53,7 @@ class Evaluate:
 
 
 def evaluate(cfg: Any) -> None:
+    """Measure one method on the shapes; tables, and files in the run folder."""
     check_options(cfg)
     from pnu import benchmark, io, metrics
     from pnu.geometry.mesh_sampling import closest_points
@@ -120,6 +121,7 @@ def check_options(cfg: Any) -> None:
 
 
 def warn(text: str) -> None:
+    """A line on stderr."""
     print(f"warning: {text}", file=sys.stderr)
 
 

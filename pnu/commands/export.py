@@ -20,6 +20,7 @@ class Export:
 
 
 def export(cfg: Any) -> None:
+    """Write a run's network as safetensors."""
     if not cfg.output.endswith(".safetensors"):
         raise ValueError(f"output={cfg.output}: expected a name that ends with .safetensors")
     if not (folder := Path(cfg.output).parent).is_dir():

@@ -35,6 +35,7 @@ class Picture:
 
 
 def picture(cfg: Any) -> None:
+    """Draw the files side by side."""
     from pnu import rendering
     from pnu.io import check_writable
     from pnu.io.cloud import TABLES

@@ -25,6 +25,7 @@ class Prepare:
 
 
 def prepare(cfg: Any) -> None:
+    """Cut patches, or describe a file of them."""
     from pnu.data.patch_file import describe
 
     path = Path(cfg.describe) if cfg.describe else instantiate(cfg.data, "pnu.data").patch_file()

@@ -40,6 +40,7 @@ class Reconstruct:
 
 
 def reconstruct(cfg: Any) -> None:
+    """Write the surface of a cloud."""
     import numpy as np
 
     from pnu import io, reconstruction
@@ -118,6 +119,7 @@ def check_options(cfg: Any) -> None:
 
 
 def warn(text: str) -> None:
+    """A line on stderr."""
     print(f"warning: {text}", file=sys.stderr)
 
 

@@ -45,6 +45,7 @@ class Upsample:
 
 
 def upsample(cfg: Any) -> None:
+    """Write the denser cloud of a file."""
     from pnu import io
 
     started = time.perf_counter()

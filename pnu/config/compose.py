@@ -79,6 +79,7 @@ def checked(overrides: Sequence[str], schema: type, compose: Callable[..., Any],
 
 
 def parse(overrides: list[str]) -> list[Any]:
+    """Overrides as Hydra's parser reads them; `ValueError` with a hint on quotes."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
@@ -207,6 +208,7 @@ def check_key(key: str, cfg: Any, schema: type, choices: Sequence[str]) -> None:
 
 
 def unknown(key: str, schema: type, choices: Sequence[str], more: Sequence[str] = ()) -> ValueError:
+    """The error for a key that does not exist: it names the nearest known one."""
     others = [choice for choice in choices if not choice.startswith("hydra/")]
     nearest = nearest_key(key, [*known_keys(schema), *others, *more], unsaid_keys(schema))
     return ValueError(f"unknown key '{key}': did you mean '{nearest}'?")

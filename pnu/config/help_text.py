@@ -70,6 +70,7 @@ def group_lines(content: Any, group: str, prefix: str, allow: Any) -> Iterator[s
 
 
 def line(key: str, value: Any, words: str) -> str:
+    """One key of the help."""
     return f"  {key + '=' + (value if value == '...' else shown(value)):<40} {words}".rstrip()
 
 

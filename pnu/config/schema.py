@@ -50,6 +50,7 @@ def doc(text: str) -> Any:
 
 
 def fields(schema: type) -> dict[str, dataclasses.Field[Any]]:
+    """The fields of a command's dataclass, by name."""
     return {field.name: field for field in dataclasses.fields(schema)}
 
 
@@ -234,12 +235,14 @@ def check_group(cfg: Any, group: str, prefix: str, allow: Sequence[str], *, comp
 
 
 def settable_here(group: str, known: Mapping[str, Argument]) -> Iterator[tuple[str, Argument]]:
+    """Which arguments of a group the config may set."""
     return ((key, argument) for key, argument in settable(group, known) if "." not in key)
 
 
 def check_arguments(
     cfg: Mapping[str, Any], group: str, prefix: str, known: Mapping[str, Argument], *, complete: bool
 ) -> dict[str, Any]:
+    """The keys of a group, each known and of its type."""
     checked: dict[str, Any] = {}
     given = GIVEN.get(group, {})
     for name in map(str, cfg):
@@ -268,6 +271,7 @@ def check_arguments(
 
 
 def no_use(group: str, key: str) -> str:
+    """Why a key that the class would take means nothing here."""
     return f"key '{key}' has no use with this {group}: --help shows the keys that do"
 
 
@@ -294,6 +298,7 @@ def get(cfg: Any, name: str, key: str, text: str, *, complete: bool) -> Any:
 
 
 def is_missing(value: Any) -> bool:
+    """Whether a value is still to be given, ???."""
     return isinstance(value, str) and value == "???"
 
 
@@ -301,6 +306,7 @@ def is_missing(value: Any) -> bool:
 
 
 def converted(value: Any, argument: Argument, key: str) -> Any:
+    """A value as its argument's type has it; `ValueError` names the key."""
     from omegaconf import OmegaConf
 
     try:
@@ -328,6 +334,7 @@ def convert(value: Any, hint: Any) -> Any:
 
 
 def exact(value: Any, hint: Any) -> Any:
+    """Whether a value is of a type as it stands."""
     origin, inner = typing.get_origin(hint) or hint, typing.get_args(hint)
     if origin is Any:
         return value
@@ -347,6 +354,7 @@ def exact(value: Any, hint: Any) -> Any:
 
 
 def meant(value: Any, hint: Any) -> Any:
+    """A value as the type that was meant, 1 as 1.0 for a float; None where it is none."""
     if hint is float and type(value) in (int, str):
         return float(value)
     if hint is int and type(value) is str:

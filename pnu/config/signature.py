@@ -86,6 +86,7 @@ def arguments_of(cls: Class) -> Iterator[tuple[str, Argument]]:
 
 
 def inherited(cls: Class) -> Iterator[tuple[str, Argument]]:
+    """The class that a class's constructor comes from."""
     for base in cls.node.bases:
         above = None
         if isinstance(base, ast.Name):
@@ -97,6 +98,7 @@ def inherited(cls: Class) -> Iterator[tuple[str, Argument]]:
 
 
 def literal(node: ast.expr | None) -> Any:
+    """The value that a default's expression stands for."""
     if node is None:
         return REQUIRED
     try:
@@ -147,6 +149,7 @@ def toplevel(body: list[ast.stmt]) -> Iterator[ast.stmt]:
 
 
 def imported_module(node: ast.Import | ast.ImportFrom, module: Module) -> str:
+    """What names an import binds, and to which modules."""
     if isinstance(node, ast.Import) or not node.level:
         return getattr(node, "module", None) or ""
     parts = module.name.split(".")
@@ -184,6 +187,7 @@ def parsed(module_name: str) -> Module | None:
 
 
 def hint_of(node: ast.expr | None, module: Module) -> Any:
+    """The type that an annotation names."""
     try:
         return read_hint(node, module) if node is not None else Any
     except NotGiveable:
@@ -234,6 +238,7 @@ def read_hint(node: ast.expr, module: Module) -> Any:
 
 
 def union(nodes: list[ast.expr], module: Module) -> Any:
+    """The types of `a | b`, as one."""
     members: list[Any] = []
     for node in nodes:
         try:
@@ -262,6 +267,7 @@ def members_of(hint: Any) -> tuple[Any, ...]:
 
 
 def last_name(node: ast.expr) -> str:
+    """The last part of a dotted name."""
     return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
 
 

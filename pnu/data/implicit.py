@@ -18,6 +18,7 @@ FINE = 20_000  # faces; a mesh of fewer shows its facets
 
 
 def sphere(center: ArrayLike, radius: float) -> Field:
+    """Distance to a sphere, negative inside."""
     return lambda p: np.linalg.norm(p - np.asarray(center), axis=1) - radius
 
 
@@ -53,6 +54,7 @@ def polyline(points: np.ndarray, radii: ArrayLike, k: float = 0.0) -> Field:
 
 
 def torus(center: ArrayLike, major: float, minor: float, axis: int = 2) -> Field:
+    """Distance to a torus, negative inside."""
     center = np.asarray(center)
 
     def field(p: np.ndarray) -> np.ndarray:

@@ -64,6 +64,7 @@ def person(arm: tuple[float, float] = (0.35, -0.25), stride: float = 0.12, lean:
 
 
 def bird() -> Mesh:
+    """A bird, around the origin."""
     tail = ellipsoid((-0.62, 0, 0.16), (0.3, 0.16, 0.035))
     parts = [ellipsoid((0, 0, 0), (0.5, 0.3, 0.3)), capsule((0.35, 0, 0.1), (0.5, 0, 0.5), 0.16, 0.1), tail,
              sphere((0.53, 0, 0.58), 0.16), capsule((0.62, 0, 0.57), (0.85, 0, 0.52), 0.07, 0.02)]  # fmt: skip
@@ -75,6 +76,7 @@ def bird() -> Mesh:
 
 
 def fish(height: float = 0.34, width: float = 0.16) -> Mesh:
+    """A fish, around the origin."""
     fin = ellipsoid((-0.1, 0, 0.95 * height), (0.3, 0.03, 0.16))
     parts = [ellipsoid((0.1, 0, 0), (0.65, width, height)), capsule((-0.4, 0, 0), (-0.65, 0, 0), 0.1, 0.05), fin]
     parts += [ellipsoid((-0.75, 0, 0.16 * s), (0.09, 0.03, 0.26), tilt(1, -0.6 * s)) for s in (1, -1)]
@@ -85,6 +87,7 @@ def fish(height: float = 0.34, width: float = 0.16) -> Mesh:
 
 
 def octopus() -> Mesh:
+    """An octopus, around the origin."""
     parts = [ellipsoid((0, 0, 0.35), (0.26, 0.26, 0.36))]
     for i in range(8):
         a = np.pi * (2 * i + 1) / 8
@@ -98,6 +101,7 @@ def octopus() -> Mesh:
 
 
 def hand() -> Mesh:
+    """A hand, around the origin."""
     parts = [ellipsoid((0, 0, -0.12), (0.31, 0.13, 0.34)), capsule((0, 0, -0.3), (0, 0, -0.75), 0.15, 0.17)]
     for x, length, spread in ((-0.23, 0.42, -0.12), (-0.08, 0.52, -0.03), (0.07, 0.49, 0.05), (0.21, 0.38, 0.14)):
         joints = np.array(
@@ -109,6 +113,7 @@ def hand() -> Mesh:
 
 
 def head() -> Mesh:
+    """A head, around the origin."""
     parts = [ellipsoid((-0.05, 0, 0.2), (0.43, 0.35, 0.42)), ellipsoid((0.1, 0, -0.12), (0.3, 0.25, 0.34)),
              capsule((-0.05, 0, -0.2), (-0.12, 0, -0.75), 0.2, 0.22), ellipsoid((-0.1, 0, -0.8), (0.28, 0.5, 0.12)),
              capsule((0.37, 0, 0.12), (0.47, 0, -0.06), 0.035, 0.065), ellipsoid((0.37, 0, -0.2), (0.06, 0.12, 0.03)),
@@ -122,6 +127,7 @@ def head() -> Mesh:
 
 
 def teddy() -> Mesh:
+    """A teddy, around the origin."""
     parts = [
         ellipsoid((0, 0, -0.2), (0.3, 0.33, 0.36)),
         sphere((0, 0, 0.37), 0.3),
@@ -137,11 +143,14 @@ def teddy() -> Mesh:
 
 
 def mushroom() -> Mesh:
+    """A mushroom, around the origin."""
     return revolution([(0, -0.7), (0.2, -0.69), (0.27, -0.55), (0.17, -0.2), (0.16, 0.1), (0.3, 0.08), (0.6, 0),
                        (0.72, 0.05), (0.66, 0.25), (0.4, 0.5), (0.15, 0.58), (0, 0.6)])  # fmt: skip
 
 
 def cactus() -> Mesh:
+    """A cactus, around the origin."""
+
     def ribs(p: np.ndarray) -> np.ndarray:
         return 0.018 * np.cos(10 * np.arctan2(p[:, 1], p[:, 0])) * np.minimum(np.hypot(p[:, 0], p[:, 1]) / 0.15, 1)
 
@@ -169,22 +178,26 @@ def tree(seed: int = 5, levels: int = 3) -> Mesh:
 
 
 def vase() -> Mesh:
+    """A vase, around the origin."""
     return revolution([(0, -0.9), (0.3, -0.9), (0.36, -0.8), (0.52, -0.3), (0.5, 0.1), (0.24, 0.5), (0.22, 0.7), (0.36, 0.9),
                        (0.33, 0.92), (0.18, 0.7), (0.2, 0.5), (0.44, 0.1), (0.46, -0.3), (0.3, -0.74), (0, -0.8)])  # fmt: skip
 
 
 def goblet() -> Mesh:
+    """A goblet, around the origin."""
     return revolution([(0, -0.9), (0.42, -0.88), (0.43, -0.85), (0.1, -0.75), (0.06, -0.4), (0.12, -0.3), (0.06, -0.2),
                        (0.2, -0.08), (0.42, 0.2), (0.45, 0.5), (0.38, 0.85), (0.35, 0.85), (0.41, 0.5), (0.37, 0.2),
                        (0.15, 0), (0, -0.03)])  # fmt: skip
 
 
 def bottle() -> Mesh:
+    """A bottle, around the origin."""
     return revolution([(0, -0.9), (0.3, -0.9), (0.34, -0.84), (0.34, -0.2), (0.34, 0.1), (0.15, 0.42), (0.12, 0.7), (0.12, 0.82),
                        (0.16, 0.84), (0.16, 0.94), (0.1, 0.95), (0.09, 0.82), (0, 0.8)])  # fmt: skip
 
 
 def pawn() -> Mesh:
+    """A pawn, around the origin."""
     return revolution([(0, -0.8), (0.42, -0.8), (0.45, -0.72), (0.38, -0.58), (0.4, -0.52), (0.26, -0.42), (0.15, 0), (0.13, 0.16),
                        (0.28, 0.24), (0.28, 0.29), (0.15, 0.34), (0.25, 0.45), (0.28, 0.57), (0.22, 0.74), (0, 0.84)])  # fmt: skip
 
@@ -200,21 +213,25 @@ def queen() -> Mesh:
 
 
 def bell() -> Mesh:
+    """A bell, around the origin."""
     return revolution([(0, 0.38), (0.2, 0.32), (0.3, 0), (0.36, -0.3), (0.58, -0.63), (0.65, -0.6), (0.44, -0.3),
                        (0.37, 0), (0.3, 0.42), (0.14, 0.54), (0.07, 0.62), (0.12, 0.72), (0, 0.8)])  # fmt: skip
 
 
 def bowl() -> Mesh:
+    """A bowl, around the origin."""
     return revolution([(0, -0.4), (0.28, -0.4), (0.3, -0.34), (0.6, -0.15), (0.85, 0.35), (0.83, 0.38), (0.79, 0.35), (0.55, -0.08),
                        (0.25, -0.26), (0, -0.28)])  # fmt: skip
 
 
 def mug() -> Mesh:
+    """A mug, around the origin."""
     body = union(drum(0.5, 0.6, 0.05), torus((0.52, 0, 0), 0.32, 0.075, axis=1), k=0.02)
     return surface_nets(cut(body, lambda p: drum(0.41, 0.6, 0.1)(p - [0, 0, 0.15]), k=0.012), [1, 0.6, 0.7], 84)
 
 
 def teapot() -> Mesh:
+    """A teapot, around the origin."""
     body = union(
         ellipsoid((0, 0, -0.05), (0.55, 0.55, 0.42)),
         ellipsoid((0, 0, 0.33), (0.3, 0.3, 0.09)),
@@ -231,6 +248,8 @@ def teapot() -> Mesh:
 
 
 def pear() -> Mesh:
+    """A pear, around the origin."""
+
     def radius(d: np.ndarray) -> np.ndarray:
         z = d[:, 2]
         return 0.62 + 0.25 * np.clip(z, 0, 1) ** 2 - 0.12 * np.sin(2.2 * z) - 0.1 * np.exp(-((z + 1) ** 2) / 0.02)
@@ -239,12 +258,15 @@ def pear() -> Mesh:
 
 
 def apple() -> Mesh:
+    """An apple, around the origin."""
     fruit = star_shaped(lambda d: 0.75 - 0.45 * np.exp((d[:, 2] - 1) / 0.08) - 0.2 * np.exp(-(d[:, 2] + 1) / 0.05))
     lobes = 1 + 0.03 * np.cos(5 * np.arctan2(*fruit.vertices[:, 1::-1].T)) * np.clip(-fruit.vertices[:, 2], 0, 1)
     return Mesh(fruit.vertices * lobes[:, None], fruit.faces)
 
 
 def pumpkin() -> Mesh:
+    """A pumpkin, around the origin."""
+
     def radius(d: np.ndarray) -> np.ndarray:
         rim = np.hypot(d[:, 0], d[:, 1])
         ribs = np.abs(np.cos(5 * np.arctan2(d[:, 1], d[:, 0]))) ** 0.7
@@ -254,6 +276,8 @@ def pumpkin() -> Mesh:
 
 
 def banana() -> Mesh:
+    """A banana, around the origin."""
+
     def curve(t: np.ndarray) -> np.ndarray:
         a = 2.4 * (t - 0.5)
         return np.stack([0.75 * np.sin(a), 0 * a, -0.75 * np.cos(a)], axis=1)
@@ -272,6 +296,7 @@ def nautilus() -> Mesh:
 
 
 def snail() -> Mesh:
+    """A snail, around the origin."""
     a = np.linspace(0, 5 * np.pi, 44)
     growth = np.exp(0.1 * (a - a[-1]))
     coil = np.stack([0.34 * growth * np.cos(a) - 0.1, 0.2 * (1 - growth), 0.34 * growth * np.sin(a) + 0.15], axis=1)
@@ -283,12 +308,15 @@ def snail() -> Mesh:
 
 
 def bone() -> Mesh:
+    """A bone, around the origin."""
     parts = [capsule((-0.6, 0, 0), (0.6, 0, 0), 0.15)]
     parts += mirrored(sphere((0.7, 0.14, 0.02), 0.2), sphere((-0.7, 0.13, -0.03), 0.21))
     return surface_nets(union(*parts, k=0.06), [1, 0.5, 0.4])
 
 
 def starfish() -> Mesh:
+    """A starfish, around the origin."""
+
     def body(p: np.ndarray) -> np.ndarray:
         a, r = np.arctan2(p[:, 1], p[:, 0]), np.hypot(p[:, 0], p[:, 1])
         reach = 0.42 + 0.36 * np.cos(5 * a) * np.minimum(r / 0.3, 1)
@@ -357,6 +385,8 @@ def knot(p: int, q: int, radius: float = 0.13, flat: float = 1.0, turns: float =
 
 
 def figure_eight() -> Mesh:
+    """A figure eight, around the origin."""
+
     def curve(t: np.ndarray) -> np.ndarray:
         a = 2 * np.pi * t
         ring = 0.55 + 0.27 * np.cos(2 * a)

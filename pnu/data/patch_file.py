@@ -134,6 +134,7 @@ def reserve(path: Path, size: int) -> None:
 
 
 def results_of(jobs: list[tuple[str, Callable[[], Mesh], int, int]], processes: int) -> Iterable[tuple[str, Patches]]:
+    """The patches of each job, as its process ends, in order."""
     if processes <= 1:
         yield from map(job, jobs)
         return
@@ -206,6 +207,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
 
 
 def contents_of(path: Path, file: h5py.File) -> Contents:
+    """What an open file holds, checked."""
     clouds = dataset(path, file, "poisson_4096")
     if clouds is None:
         raise ValueError(f"{path}: lacks the dataset poisson_4096 (patches, points, 6); it has {listing(file)}")
@@ -335,6 +337,8 @@ def parameters_of(file: h5py.File) -> dict[str, Any]:
 
 
 def listing(file: h5py.File) -> str:
+    """The datasets of a file as one line."""
+
     def told(name: str) -> str:
         item = file[name] if is_own(file, name) else "a link"
         if isinstance(item, h5py.Dataset):
@@ -345,6 +349,7 @@ def listing(file: h5py.File) -> str:
 
 
 def names_of(path: Path, file: h5py.File, patches: int) -> list[str] | None:
+    """The name of each patch's shape, or None where the file has none."""
     names = dataset(path, file, "name")
     if names is None:
         return None

@@ -224,6 +224,7 @@ class GeneratedDataModule(PatchDataModule):
 
 
 def say(text: str) -> None:
+    """A line on stderr."""
     print(text, file=sys.stderr)
 
 

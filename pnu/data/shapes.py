@@ -22,7 +22,7 @@ def names(*kinds: str) -> list[str]:
 
 
 def make(name: str) -> Mesh:
-    """The closed mesh of that name, faces outward, centerd in its box, greatest distance from the center 1."""
+    """The closed mesh of that name, faces outward, centered in its box, greatest distance from the center 1."""
     for shapes in KINDS.values():
         if name in shapes:
             return unit(shapes[name]())

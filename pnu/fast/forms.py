@@ -58,6 +58,7 @@ def from_products(layer: layers.Layer, products: Tensor) -> Tensor:
 
 
 def stacked(mlp: layers.MLP) -> Sequence[layers.Layer]:
+    """The layers of an MLP, for the streamed form."""
     return [layer for layer in mlp if isinstance(layer, layers.Layer)]
 
 
@@ -68,6 +69,8 @@ def first_weight(mlp: layers.MLP, split: int) -> tuple[Tensor, Tensor]:
 
 
 class MLP(layers.MLP):
+    """`networks.layers.MLP`, its layers streamed."""
+
     def forward(self, x: Tensor) -> Tensor:
         return through(self, x)
 

@@ -16,6 +16,8 @@ PIECE = 1024  # points whose neighbors are handled at once
 
 
 class CompoundLoss(compound.CompoundLoss):
+    """`losses.CompoundLoss`, its neighborhood terms in one pass."""
+
     def neighborhood_terms(self, prediction: Tensor, neighbors: Tensor) -> dict[str, Tensor]:
         if prediction.shape[-1] != 6 or prediction.device.type != "cpu":
             return super().neighborhood_terms(prediction, neighbors)

@@ -106,6 +106,7 @@ def bare(line: str) -> str:
 
 
 def is_number(text: str) -> bool:
+    """Whether a word is a number, with a decimal point."""
     try:
         float(text)
     except ValueError:

@@ -14,6 +14,7 @@ COLUMNS = ("cartesianX", "cartesianY", "cartesianZ", "intensity", "colorRed", "c
 
 
 def main(source: str) -> None:
+    """Write the columns of a file's scans to stdout."""
     import numpy as np
     import pye57
 

@@ -11,6 +11,7 @@ ROOM = 2**30  # bytes, for a small file
 
 
 def main(source: str, points: str) -> None:
+    """Write the records of a file to stdout."""
     import laspy
 
     limit_memory(ROOM + 8 * Path(source).stat().st_size)

@@ -101,6 +101,7 @@ def xyz_columns(points: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def ply_normals(normals: np.ndarray | None) -> dict[str, np.ndarray]:
+    """Normals as properties of ply."""
     return {} if normals is None else dict(zip(NORMAL, np.asarray(normals, np.float32).T, strict=True))
 
 
@@ -236,6 +237,7 @@ def read_off(path: Path) -> Geometry:
 
 
 def read_stl(path: Path) -> Geometry:
+    """STL, text or binary; corners at one place become one vertex."""
     data = path.read_bytes()
     count = int.from_bytes(data[80:84], "little")
     if len(data) >= 84 and len(data) == 84 + 50 * count:
@@ -261,11 +263,13 @@ def read_stl(path: Path) -> Geometry:
 
 
 def read_gltf_mesh(path: Path) -> Geometry:
+    """The meshes of a glTF file as one."""
     vertices, faces, colors = read_gltf(path)
     return Geometry(vertices, faces, None, colors)
 
 
 def read_vtk_mesh(path: Path) -> Geometry:
+    """The polygons of a vtk or vtp file."""
     vertices, counts, corners, columns = read_vtk(path)
     colors = columns.get("colors", columns.get("RGB"))
     good = colors is not None and colors.ndim == 2 and colors.shape[1] in (3, 4)
@@ -275,6 +279,7 @@ def read_vtk_mesh(path: Path) -> Geometry:
 
 
 def write_obj(path: Path, geometry: Geometry) -> None:
+    """Wavefront: v, vn where there are normals, f."""
     vertices, faces, normals, colors = geometry
     rows = vertices if colors is None else np.hstack([vertices, np.asarray(colors) / 255])
     with path.open("w", encoding="ascii") as handle:
@@ -286,6 +291,7 @@ def write_obj(path: Path, geometry: Geometry) -> None:
 
 
 def write_off(path: Path, geometry: Geometry) -> None:
+    """OFF, with normals as NOFF."""
     vertices, faces, normals, colors = geometry
     rows, form = [vertices], "%.15g %.15g %.15g"
     if normals is not None:

@@ -32,6 +32,8 @@ class Property(NamedTuple):
 
 
 class Element(NamedTuple):
+    """An element of a header: its name, count and properties."""
+
     name: str
     size: int
     properties: list[Property]

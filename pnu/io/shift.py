@@ -22,6 +22,7 @@ class Shifted(NamedTuple):
 
 
 def single_is_enough(points: np.ndarray) -> bool:
+    """Whether float32 keeps points to a millionth of their extent."""
     with np.errstate(over="ignore", invalid="ignore"):
         moved = np.abs(points.astype(np.float32) - points).max(initial=0)
     return bool(moved <= ENOUGH * np.ptp(points, axis=0).max(initial=0))

@@ -21,6 +21,7 @@ def open_file(path: Path, content: str, suffixes: Iterable[str]) -> str:
 
 
 def known_suffix(path: Path, content: str, suffixes: Iterable[str]) -> str:
+    """The suffix of a path, in lower case; `ValueError` names those that are known."""
     suffix = path.suffix.lower()
     if suffix not in suffixes:
         found = f"the suffix '{path.suffix}'" if path.suffix else "no suffix"

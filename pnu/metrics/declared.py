@@ -74,6 +74,8 @@ class Metric:
 
 
 class ChamferSq(Metric):
+    """Chamfer distance: mean squared nearest distances, both ways added."""
+
     shown = Shown("chamfer_sq", "CD x 1e3", "CD", 1e3, "length squared", ".4f")
 
     def __call__(self, pair: Pair) -> Tensor:
@@ -81,6 +83,8 @@ class ChamferSq(Metric):
 
 
 class HausdorffSq(Metric):
+    """Hausdorff distance, squared: the larger of both maxima."""
+
     shown = Shown("hausdorff_sq", "HD (squared) x 1e3", "HD", 1e3, "length squared")
 
     def __call__(self, pair: Pair) -> Tensor:
@@ -88,6 +92,8 @@ class HausdorffSq(Metric):
 
 
 class P2F(Metric):
+    """Mean distance to the true mesh."""
+
     shown = Shown("p2f", "P2F x 1e3", "P2F", 1e3, "length")
     needs = ("mesh",)
 
@@ -96,6 +102,8 @@ class P2F(Metric):
 
 
 class NormalDeg(Metric):
+    """Mean angle to the true normal, 0 to 180 degrees."""
+
     shown = Shown("normal_deg", "normal error, signed (deg)", "normal", unit="degrees", form=".2f")
     needs = ("normals",)
 
@@ -104,6 +112,8 @@ class NormalDeg(Metric):
 
 
 class NormalUnsignedDeg(Metric):
+    """Mean angle between the lines of the normals, 0 to 90 degrees."""
+
     shown = Shown("normal_unsigned_deg", "normal error, unsigned (deg)", "unsigned", unit="degrees", form=".2f")
     needs = ("normals",)
 
@@ -112,6 +122,8 @@ class NormalUnsignedDeg(Metric):
 
 
 class Flipped(Metric):
+    """Share of normals more than 90 degrees off."""
+
     shown = Shown("flipped", "normals flipped (%)", "flipped", 100.0, "share", ".2f")
     needs = ("normals",)
 
@@ -120,6 +132,8 @@ class Flipped(Metric):
 
 
 class SpacingCV(Metric):
+    """Variation of the distance to the nearest point."""
+
     shown = Shown("spacing_cv", "spacing, variation", "spacing")
     needs = ()
 
@@ -128,6 +142,8 @@ class SpacingCV(Metric):
 
 
 class UniformityCV(Metric):
+    """Variation of the number of points on equal areas."""
+
     shown = Shown("uniformity", "density, variation", "uniform.")
     patches = False
 

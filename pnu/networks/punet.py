@@ -92,5 +92,6 @@ def coordinates(patch: Tensor) -> Tensor:
 
 
 def check_ratio(ratio: int) -> None:
+    """`ValueError` for a ratio that is no whole number from 2 on."""
     if not (isinstance(ratio, int) and ratio >= 2):
         raise ValueError(f"model.ratio: expected a whole number from 2 on, got {ratio!r}")

@@ -12,6 +12,7 @@ CANNOT_IMPORT = 3
 
 
 def main(source: str, target: str) -> None:
+    """Reconstruct the cloud in one file, the surface into another."""
     try:
         import open3d
     except (ImportError, OSError) as error:

@@ -104,6 +104,7 @@ def octree_depth(points: NDArray) -> int:
 
 
 def run_child(points: Array, normals: Array, depth: int, timeout: float) -> dict[str, NDArray]:
+    """The surface that a process of its own makes; `ValueError` where it crashes or takes too long."""
     with tempfile.TemporaryDirectory(prefix="pnu-") as folder:
         source, target = Path(folder, "cloud.npz"), Path(folder, "mesh.npz")
         np.savez(source, points=points, normals=normals, depth=depth)

@@ -90,6 +90,7 @@ def save_png(path: str | Path, picture: Picture) -> None:
 
 
 def is_drawn(picture: Picture) -> bool:
+    """Whether a picture shows more than its background."""
     return picture.size > 0 and bool((picture != picture.flat[0]).any())
 
 
@@ -107,6 +108,7 @@ def fitting_font(texts: Sequence[str], size: float, width: int) -> ImageFont.Fre
 
 
 def typeface(size: float) -> ImageFont.FreeTypeFont:
+    """The font of a size, in pixels."""
     font = ImageFont.load_default(max(size, 8))
     if not isinstance(font, ImageFont.FreeTypeFont):
         raise RuntimeError("Pillow was built without FreeType; install its wheel: pip install --force-reinstall pillow")

@@ -126,6 +126,7 @@ def project(camera: Camera, points: Array, pixels: int) -> Array:
 
 
 def pixel_middle(pixel: NDArray[np.int64], width: int) -> Array:
+    """The middle of pixels, in pixels."""
     return np.stack([pixel % width, pixel // width], 1).astype(np.float64) + 0.5
 
 

@@ -34,6 +34,7 @@ def sheets(study: Study, width: int = 560) -> dict[str, NDArray[np.uint8]]:
 
 
 def pad(picture: Image.Image, size: tuple[int, int]) -> Image.Image:
+    """A picture on white, of a given size."""
     canvas = Image.new("RGB", size, "white")
     canvas.paste(picture, ((size[0] - picture.width) // 2, (size[1] - picture.height) // 2))
     return canvas

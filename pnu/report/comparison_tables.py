@@ -38,6 +38,7 @@ def tables(
 
 
 def means(rows: Sequence[Row], shapes: int, metrics: Sequence[Metric]) -> offline_page.Table:
+    """The table of each method's means over the shapes."""
     all_shown = columns(rows, metrics)
     heads = [offline_page.Column(shown.head or shown.title, shown.form, better=shown.better) for shown in all_shown]
     body = [
@@ -50,6 +51,7 @@ def means(rows: Sequence[Row], shapes: int, metrics: Sequence[Metric]) -> offlin
 
 
 def table_1(rows: Sequence[Row], shapes: Sequence[str]) -> offline_page.Table:
+    """The paper's Table 1: CD and HD of each shape."""
     both = ChamferSq.shown, HausdorffSq.shown
     heads = [offline_page.Column(shape, shown.form, group=shown.head) for shown in both for shape in shapes]
     by_place = {(row["method"], row["shape"]): row for row in rows}
@@ -81,8 +83,10 @@ def surface_table(rows: Sequence[Row]) -> offline_page.Table:
 
 
 def scaled(row: Mapping[str, Any], shown: Shown) -> float | None:
+    """A value times the factor of its table."""
     return shown.factor * row[shown.name] if shown.name in row else None
 
 
 def references_last(rows: Sequence[offline_page.Row]) -> list[offline_page.Row]:
+    """The rows, those of input and floor last."""
     return sorted(rows, key=lambda row: row.reference)

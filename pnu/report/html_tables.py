@@ -25,6 +25,8 @@ class Row(NamedTuple):
 
 
 class Table(NamedTuple):
+    """A table of a page."""
+
     caption: str
     columns: Sequence[Column]
     rows: Sequence[Row]
@@ -83,6 +85,7 @@ def typeset(table: Table) -> Set:
 
 
 def shown(number: float | None, form: str) -> str:
+    """A number as a cell shows it."""
     return "-" if number is None or not math.isfinite(number) else format(number, form)
 
 

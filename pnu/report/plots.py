@@ -110,18 +110,21 @@ def plot(caption: str, drawn: Sequence[Panel], legend: Sequence[str] = (), colum
 
 
 def svg(figure: "Figure") -> str:
+    """A figure as SVG."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     return buffer.getvalue()
 
 
 def png(figure: "Figure") -> bytes:
+    """A figure as PNG."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=150, metadata={"Software": None})
     return buffer.getvalue()
 
 
 def color(index: int) -> str:
+    """The color of the i-th line."""
     return COLORS[index % len(COLORS)]
 
 
@@ -151,10 +154,13 @@ def logarithmic(axis: "Axis", values: Iterable[float]) -> None:
 
 
 def scaled(study: Study, metric: str, values: Iterable[float]) -> list[float]:
+    """Values in the unit of a metric's axis."""
     return [study.shown(metric).factor * value for value in values]
 
 
 def settings_panel(study: Study, metric: str) -> Panel:
+    """A metric of each setting, with its seeds."""
+
     def draw(axes: "Axes") -> None:
         summary = study.summary(study.baseline, metric) if study.baseline else None
         if summary is not None and summary.spread is not None:
@@ -174,6 +180,8 @@ def settings_panel(study: Study, metric: str) -> Panel:
 
 
 def effect_panel(study: Study, key: str, metric: str) -> Panel:
+    """A metric against a number that the settings vary."""
+
     def draw(axes: "Axes") -> None:
         pairs = [(value, setting) for value, setting in effects(study)[key] if setting.of(metric)]
         values = [value for value, _ in pairs]
@@ -198,11 +206,13 @@ def effect_panel(study: Study, key: str, metric: str) -> Panel:
 
 
 def spread_of(study: Study, setting: Setting, metric: str) -> float:
+    """Standard deviation over the seeds of a setting."""
     summary = study.summary(setting, metric)
     return (summary.spread or 0.0) if summary else 0.0
 
 
 def curve_panel(study: Study, name: str) -> Panel | None:
+    """A value during the training, mean over seeds."""
     curves = [mean_curve(setting, name) for setting in study.settings]
     if not any(len(curve) > 1 for curve in curves):
         return None
@@ -250,6 +260,8 @@ def mean_curve(setting: Setting, name: str, points: int = 200) -> Curve:
 
 
 def pareto_panel(study: Study, normals: str) -> Panel:
+    """Chamfer distance against the error of the normals."""
+
     def draw(axes: "Axes") -> None:
         places = {
             i: (scaled(study, "chamfer_sq", [s.mean("chamfer_sq")])[0], scaled(study, normals, [s.mean(normals)])[0])

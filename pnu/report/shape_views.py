@@ -105,6 +105,7 @@ def view(shown: Shown, rebuilt: Mapping[str, Rebuilt], points: int) -> offline_p
 
 
 def thinned(cloud: NDArray, points: int) -> NDArray:
+    """At most so many points of a cloud, evenly taken."""
     return cloud[:: -(-len(cloud) // points)]
 
 

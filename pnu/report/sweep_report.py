@@ -46,6 +46,7 @@ def write_report(study: Study, folder: Path) -> list[Path]:
 
 
 def webp(picture: np.ndarray) -> bytes:
+    """A picture as WebP."""
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, "WEBP", quality=80)
     return buffer.getvalue()
@@ -69,6 +70,7 @@ def facts(study: Study) -> list[str]:
 
 
 def command_of(study: Study) -> str:
+    """The command line that started the sweep."""
     return retyped(str(study.settings[0].runs[0].record.get("command", "")))
 
 
@@ -84,6 +86,7 @@ def cell(study: Study, setting: Setting, metric: str) -> tuple[str, str, bool]:
 
 
 def reading(study: Study) -> str:
+    """How the tables are to be read."""
     return READING + COMPARED * (not study.search)
 
 
@@ -100,10 +103,12 @@ def differing(setting: Setting, baseline: Setting | None) -> str:
 
 
 def failures(study: Study) -> list[str]:
+    """A line for each run that did not finish."""
     return [f"{run.folder.path.name}: {status(run)}" for run in study.unfinished]
 
 
 def status(run: Run) -> str:
+    """How far a run came."""
     found = state(run.folder)
     if found == "running" and not runs_elsewhere(run.folder):  # on another machine, as far as its file system tells
         return "running, or ended without a word (kill, power cut); the same command goes on with it"
@@ -113,6 +118,7 @@ def status(run: Run) -> str:
 
 
 def markdown(study: Study, drawn: Mapping[str, Plot], shapes: Sequence[str]) -> str:
+    """The report as Markdown."""
     metrics = study.metrics
     lines = [f"# {study.folder.name}", "", *facts(study), ""]
     if command := command_of(study):
@@ -140,6 +146,7 @@ def markdown(study: Study, drawn: Mapping[str, Plot], shapes: Sequence[str]) -> 
 
 
 def page_html(study: Study, drawn: Mapping[str, Plot], pictures: Mapping[str, bytes]) -> str:
+    """The report as one page."""
     return offline_page.render(
         "report.html",
         title=study.folder.name,
@@ -168,6 +175,7 @@ def settings_table(study: Study) -> offline_page.Set:
 
 
 def summary_rows(study: Study) -> list[dict[str, Any]]:
+    """A row for each setting and metric."""
     rows = []
     for setting in study.settings:
         for metric in study.metrics:

@@ -139,6 +139,7 @@ def collect(folder: str | Path, baseline: str | None = None) -> Study:
 
 
 def read(folder: RunFolder) -> Run:
+    """A run of a sweep, from its folder."""
     record = folder.read_record()
     config = yaml.safe_load(folder.config.read_text("utf-8")) if folder.config.exists() else {}
     flat = {key: value for key, value in flatten(config).items() if not isinstance(value, Mapping)}
@@ -147,6 +148,7 @@ def read(folder: RunFolder) -> Run:
 
 
 def grouped(found: Sequence[Run]) -> list[Setting]:
+    """Runs that differ in their seed alone, together."""
     ignored = {*UNHASHED, *REPEATED, *(f"data.{name}" for name in UNHASHED_DATA)}
     keys = {key: None for run in found for key in run.config}
     kept = [key for key in keys if key not in ignored and key.partition(".")[0] not in UNHASHED]
@@ -163,6 +165,7 @@ def grouped(found: Sequence[Run]) -> list[Setting]:
 
 
 def given_name(run: Run) -> str:
+    """The name of a run's setting, where one was chosen."""
     return str(run.record.get("setting") or "").rpartition("/")[2]
 
 
@@ -173,6 +176,7 @@ def long_name(setting: Setting) -> str:
 
 
 def short(value: Any) -> str:
+    """A value in few letters."""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
@@ -191,8 +195,10 @@ def effects(study: Study) -> dict[str, list[tuple[float, Setting]]]:
 
 
 def by_value(key: str, settings: Sequence[Setting]) -> list[tuple[float, Setting]]:
+    """Settings in the order of a number that they vary."""
     return sorted(((float(setting.values[key]), setting) for setting in settings), key=lambda pair: pair[0])
 
 
 def number(value: Any) -> bool:
+    """A value as a number, or None."""
     return isinstance(value, int | float) and not isinstance(value, bool)

@@ -84,6 +84,7 @@ def encode(view: View) -> dict[str, Any]:
 def vertices(
     packer: Packer, view: View, points: NDArray, normals: NDArray | None, error: NDArray | None
 ) -> dict[str, Any]:
+    """Points with their normals and errors, packed."""
     unit = (points - view.center) / (RANGE * view.radius)
     places = {"position": packer.add(np.rint((unit.clip(-1, 1) + 1) * 32767.5), "<u2")}
     if normals is not None:

@@ -46,6 +46,7 @@ def git_revision() -> str | None:
 
 
 def short_revision(revision: str) -> str:
+    """The first ten digits, with the mark of changes."""
     return revision[:10] + "+" * revision.endswith("+")
 
 

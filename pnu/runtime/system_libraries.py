@@ -29,6 +29,7 @@ def missing_packages() -> list[str]:
 
 
 def install_line(packages: list[str]) -> str:
+    """The line that installs Debian packages."""
     return f"apt-get install --no-install-recommends {' '.join(packages)}"
 
 
@@ -50,6 +51,7 @@ def open3d_error() -> str | None:
 
 
 def main() -> None:
+    """`pnu doctor`."""
     arguments = sys.argv[1:]
     if set(arguments) - {"--install", "--require"}:
         sys.exit(__doc__)

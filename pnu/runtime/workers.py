@@ -98,6 +98,7 @@ class Processes:
 
 @contextmanager
 def sigint_ignored() -> Iterator[None]:
+    """Ctrl-C goes past this process, and those it starts."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

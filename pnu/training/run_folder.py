@@ -196,6 +196,7 @@ def config_hash(config: Mapping[str, Any]) -> str:
 
 
 def versions() -> dict[str, str]:
+    """Versions of Python and the packages that results depend on."""
     found = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -206,6 +207,7 @@ def versions() -> dict[str, str]:
 
 
 def now() -> str:
+    """The time, UTC, to the second."""
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
 
 

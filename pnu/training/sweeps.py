@@ -129,6 +129,7 @@ def locked(path: Path) -> int:
 
 
 def runs_elsewhere(run: RunFolder) -> bool:
+    """Whether another process holds the lock of a run."""
     try:
         os.close(locked(run.path))
     except ValueError:

@@ -135,6 +135,7 @@ def example(network: nn.Module) -> Tensor:
 
 
 def patches_at_once(like: Tensor, batch_size: int | None) -> int:
+    """Patches that go through the network together."""
     return 1 if like.device.type == "cpu" else batch_size or 64
 
 

@@ -35,6 +35,7 @@ def upsampler_of(model: Any, patch_size: int | None = None) -> Upsampler:
 
 
 def is_projection(network: Any) -> bool:
+    """Whether a network projects points, and takes no patches."""
     return getattr(network, "procedure", "patches") == "surface"
 
 

@@ -147,6 +147,7 @@ def by_neighbors(
 
 
 def queries_at_once(cloud: Tensor, batch_size: int | None) -> int:
+    """Queries that go through the network together."""
     return batch_size or (BATCH if cloud.device.type == "cpu" else 2**16)
 
 
