@@ -19,14 +19,15 @@ PNU = {"_target_": "pnu.networks.pnu.PNU", "ratio": 2, "local_features": False}
 WRITERS = """
 import functools, sys, torch
 from pathlib import Path
-from pnu import checkpoint, io, weights
-from pnu.data import patchset, shapes
+from pnu import io, weights
+from pnu.data import patch_file, shapes
+from pnu.networks import checkpoints
 state = {"x": torch.zeros(100_000)}
 writers = {
-    "c.ckpt": lambda path: checkpoint.write(path, {"state_dict": state}),
+    "c.ckpt": lambda path: checkpoints.write(path, {"state_dict": state}),
     "w.safetensors": lambda path: weights.write(path, {}, state),
-    "p.h5": lambda path: patchset.build(path, {"mug": functools.partial(shapes.make, "mug")}, 2),
-    "run": lambda path: checkpoint.save(path, torch.nn.Linear(300, 300), {}, {}),
+    "p.h5": lambda path: patch_file.cut_patch_file(path, {"mug": functools.partial(shapes.make, "mug")}, 2),
+    "run": lambda path: checkpoints.save(path, torch.nn.Linear(300, 300), {}, {}),
     **{f"c{suffix}": lambda path: io.write_cloud(path, torch.rand(9000, 3).numpy()) for suffix in io.OUTPUT_SUFFIXES},
     **{f"m{suffix}": lambda path: io.write_mesh(path, shapes.make("mug")) for suffix in io.MESH_SUFFIXES},
 }

@@ -150,7 +150,9 @@ def test_child_may_fail_without_loss(
 
 def test_missing_open3d_has_its_own_exit_code(tmp_path: Path) -> None:
     (tmp_path / "open3d.py").write_text("raise ImportError('libGL.so.1: cannot open shared object file')")
-    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from pnu.reconstruction import poisson_child as child; "
+    code = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from pnu.reconstruction import poisson_process as child; "
+    )
     run = subprocess.run(
         [sys.executable, "-c", code + "child.main('', '')"], capture_output=True, text=True, check=False
     )

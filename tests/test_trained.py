@@ -87,5 +87,5 @@ def test_names_of_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     keys = {"ratio": 4, "passes": False, "batch_size": None, "device": "cpu", "seed": 0}
     cfg = OmegaConf.create({"methods": [str(folder) for folder in folders]} | keys)
-    monkeypatch.setattr("pnu.compare.runs_of_sweep", lambda method: [])
+    monkeypatch.setattr("pnu.commands.compare.runs_of_sweep", lambda method: [])
     assert list(upsamplers(cfg)) == ["12-30-01_wide", "12-31-01_wide", "deep"]

@@ -209,8 +209,8 @@ def test_killed_and_gone_on(tmp_path: Path) -> None:
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     write_cloud(tmp_path / "cloud.ply", points, points)
     code = (
-        "import pnu.upsample as module; from pnu.upsamplers import surface\n"
-        "if __name__ == '__main__': module.LONG, surface.KEPT = 1, 2**12; module.main()"
+        "import pnu.commands.upsample as module; from pnu.upsamplers import surface_projection\n"
+        "if __name__ == '__main__': module.LONG, surface_projection.KEPT = 1, 2**12; module.main()"
     )
     (tmp_path / "run.py").write_text(code)
 
