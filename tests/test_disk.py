@@ -29,7 +29,7 @@ writers = {
     "p.h5": lambda path: patch_file.cut_patch_file(path, {"mug": functools.partial(shapes.make, "mug")}, 2),
     "run": lambda path: checkpoints.save(path, torch.nn.Linear(300, 300), {}, {}),
     **{f"c{suffix}": lambda path: io.write_cloud(path, torch.rand(9000, 3).numpy()) for suffix in io.OUTPUT_SUFFIXES},
-    **{f"m{suffix}": lambda path: io.write_mesh(path, shapes.make("mug")) for suffix in io.MESH_SUFFIXES},
+    **{f"m{suffix}": lambda path: io.write_mesh(path, shapes.make("mug")) for suffix in io.MESH_OUTPUTS},
 }
 torch.nn.Linear.ratio = 1
 for name, write in writers.items():

@@ -246,10 +246,10 @@ def test_an_evaluation_then_a_comparison(say: Say, trained: str) -> None:
     line = printed(measured)
     say(line, *small, "surfaces=[]", "size=64", "output=page")
     page = Path("page/index.html").read_text(encoding="utf-8")
-    made = re.search(r"Made by: (python [^<]*)", page)
+    made = re.search(r"Made by: (pnu [^<]*)", page)
     assert made is not None
     again = html.unescape(made[1])
-    assert words(again)[:4] == words(line)[:4]
+    assert words(again)[:3] == words(line)[:3]
 
 
 def test_a_name_that_is_taken(say: Say, capsys: pytest.CaptureFixture[str]) -> None:
