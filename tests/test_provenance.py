@@ -38,12 +38,12 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ],
 )
 def test_a_tree_with_files_that_count_is_not_clean(name: str, dirty: bool, checkout: Path) -> None:
-    clean = provenance.git_revision()
+    clean = provenance_of.git_revision()
     assert clean is not None
     assert re.fullmatch("[0-9a-f]{40}", clean)
     (checkout / name).parent.mkdir(parents=True, exist_ok=True)
     (checkout / name).write_text("x")
-    assert provenance.git_revision() == clean + "+" * dirty
+    assert provenance_of.git_revision() == clean + "+" * dirty
 
 
 def test_the_line_of_a_table() -> None:

@@ -176,7 +176,7 @@ def test_a_patch_file_opens_no_other_file(tmp_path: Path, trap: Path, kind: str)
         assert "outside (a link)" in patch_file.describe(tmp_path / "patches.h5")["datasets"]
         return
     with pytest.raises(ValueError, match=r"patches\.h5: poisson_4096 is a link or lies in another file"):
-        patch_file.check(tmp_path / "patches.h5")
+        patch_file.check_patch_file(tmp_path / "patches.h5")
 
 
 @pytest.mark.parametrize("name", ["mesh.obj", "mesh.ply"])

@@ -157,7 +157,7 @@ def test_prepare(tmp_path: Path) -> None:
     while kills < 5:
         kills += killed(start(tmp_path, "prepare", *line), moments(tmp_path / "data", rng, 6, writes=1))
         for path in (tmp_path / "data").glob("[!.]*"):
-            patch_file.check(path)
+            patch_file.check_patch_file(path)
             path.unlink()
     finish(tmp_path, "prepare", *line)
     finish(tmp_path, "prepare", *line, "data.cache=whole")
