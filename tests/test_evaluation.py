@@ -387,7 +387,7 @@ def test_command_with_a_run(place: Path, capsys: pytest.CaptureFixture[str]) -> 
     folder = place / "outputs" / "small" / "evaluation" / "synthetic"
     assert "random: 256 -> 512 points" in out
     assert "normals of the input estimated. " in out
-    assert "CD: mean squared distances" in out
+    assert "CD: mean squared distances" in " ".join(out.split())
     assert "output: outputs/small/evaluation/synthetic/metrics.json" in out
     assert out.endswith("next:   pnu compare 'methods=[outputs/small,apss]'\n")
     found = read_json(folder / "metrics.json")

@@ -118,7 +118,7 @@ def test_sampling_compares_on_the_same_clouds(patch_file: Path) -> None:  # noqa
     def batch(part: str, **options: str) -> torch.Tensor:
         data = PatchDataModule(str(patch_file), batch_size=2, input_points=64, target_points=256, **options)
         data.setup()
-        return next(iter(data.loader(data.dataset(part))))["input"]
+        return next(iter(data.loader(data.dataset(part), 2)))["input"]
 
     uniform = {"downsampling": "poisson", "evaluation": "nonuniform"}
     assert torch.equal(batch("val", **uniform), batch("val"))
@@ -215,7 +215,6 @@ def test_killed_in_the_middle_and_started_again(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     line = [*small(patch_file), "ablation=loss_terms", "scale=small", "setting=default,loss_terms/cd", "seed=0"]
-    line += ["~data.patches"]  # of shapes, not of a file
     # longer than `small`, with a checkpoint at each step, so that it can be killed within the second job
     line += ["data.batch_size=2", "data.augmentation=null", "trainer.max_steps=8", "trainer.max_epochs=-1"]
     line += ["callbacks.checkpoints.every_n_steps=1", "trainer.val_check_interval=4", "sweep=s"]
