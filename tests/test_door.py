@@ -48,6 +48,13 @@ def test_each_place_counts_once() -> None:
     assert cloud.notes == ("3 of 43 points left out: at the place of another",)
 
 
+def test_a_piece_at_the_origin_is_no_zeros() -> None:
+    points = np.vstack([POINTS, 1e8 + POINTS])
+    cloud = check_cloud(Cloud(points, None, {}), "c")
+    np.testing.assert_array_equal(cloud.points, points)
+    assert cloud.notes == ()
+
+
 @pytest.mark.parametrize("nothing", [0, 1e-9])
 def test_zeros_where_a_sensor_saw_nothing(nothing: float) -> None:
     points = np.vstack([POINTS, np.full((30, 3), nothing)])

@@ -92,7 +92,8 @@ def check_cloud(cloud: Cloud, name: str, *, minimum: int = 16) -> Cloud:
     first = first_of_each_place(cloud.points, cloud.normals)
     size = np.abs(cloud.points).max(axis=1)
     unseen = size <= ORIGIN * np.median(size[first])
-    if unseen.sum() > UNSEEN * count / len(first):  # far more often than any place is repeated
+    places = unseen[first].sum()  # a piece of a cloud that happens to lie at the origin has many
+    if places and unseen.sum() / places > UNSEEN * count / len(first):
         notes.append(f"{unseen.sum()} of {count} points left out: at the origin, where a sensor saw nothing")
         count, first = count - unseen.sum(), first[~unseen[first]]
     if len(first) < count:
