@@ -121,7 +121,15 @@ def cloud(n: int = 2, points: int = 128) -> np.ndarray:
             {"poisson_4096": cloud(), "name": [b"a"]},
             r"name must have one entry for each of the 2 patches, found \(1,\)",
         ),
-        ({"poisson_4096": cloud(), "montecarlo_1024": cloud(3)}, r"montecarlo_1024 must have shape \(2, points, 6\)"),
+        (
+            {"poisson_4096": cloud(), "edges": np.full((2, 4, 3), b"x")},
+            "edges must hold floating-point numbers, found |S1",
+        ),
+        (
+            {"poisson_4096": cloud(), "montecarlo_1024": cloud(3)},
+            r"montecarlo_1024 must have shape \(2, 64 or more points, 6\)",
+        ),
+        ({"poisson_4096": cloud(), "montecarlo_1024": cloud(points=0)}, r"64 or more points, 6\), found \(2, 0, 6\)"),
         ({"poisson_4096": cloud(), "edges": cloud()}, r"edges must have shape \(2, points, 3\)"),
     ],
 )

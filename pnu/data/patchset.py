@@ -28,7 +28,7 @@ EDGE_POINTS = 256
 SHARES = (0.3, 0.1)  # of its shape that a patch covers
 OVERSAMPLING = 5  # random points from which each of the evenly spread ones is chosen
 LEAST = 64  # different points of a patch
-CHECKED = 64  # patches that are checked at once
+CHECKED = 2**18  # points that are checked at once
 DENSEST = 100  # bytes that a byte of the file may stand for; compressed coordinates stay far below, forged headers not
 
 
@@ -211,15 +211,19 @@ def contents_of(path: Path, file: h5py.File) -> Contents:
         raise ValueError(f"{path}: lacks the dataset poisson_4096 (patches, points, 6); it has {listing(file)}")
     if clouds.ndim != 3 or clouds.shape[2] != 6 or clouds.shape[0] < 1 or clouds.shape[1] < 64:
         raise ValueError(f"{path}: poisson_4096 must have shape (patches, 64 or more points, 6), found {clouds.shape}")
-    if clouds.dtype.kind != "f":
-        raise ValueError(f"{path}: poisson_4096 must hold floating-point numbers, found {clouds.dtype}")
     names = names_of(path, file, len(clouds))
     given = dataset(path, file, "montecarlo_1024")
-    if given is not None and (given.ndim != 3 or given.shape[0] != len(clouds) or given.shape[2] != 6):
-        raise ValueError(f"{path}: montecarlo_1024 must have shape ({len(clouds)}, points, 6), found {given.shape}")
+    if given is not None and (
+        given.ndim != 3 or given.shape[0] != len(clouds) or given.shape[1] < LEAST or given.shape[2] != 6
+    ):
+        expected = f"({len(clouds)}, {LEAST} or more points, 6)"
+        raise ValueError(f"{path}: montecarlo_1024 must have shape {expected}, found {given.shape}")
     edges = dataset(path, file, "edges")
     if edges is not None and (edges.ndim != 3 or edges.shape[0] != len(clouds) or edges.shape[2] != 3):
         raise ValueError(f"{path}: edges must have shape ({len(clouds)}, points, 3), found {edges.shape}")
+    for name, values in (("poisson_4096", clouds), ("montecarlo_1024", given), ("edges", edges)):
+        if values is not None and values.dtype.kind != "f":
+            raise ValueError(f"{path}: {name} must hold floating-point numbers, found {values.dtype}")
     check_clouds(path, "poisson_4096", clouds)
     if given is not None:
         check_clouds(path, "montecarlo_1024", given)
@@ -236,9 +240,10 @@ def check_clouds(path: Path, name: str, clouds: h5py.Dataset) -> None:
     different points, or less than 99 % of unit normals."""
     faults: dict[str, list[int]] = {"values": [], "points": [], "normals": []}
     told: dict[str, str] = {}
-    for start in range(0, len(clouds), CHECKED):
+    step = max(1, CHECKED // clouds.shape[1])
+    for start in range(0, len(clouds), step):
         with np.errstate(over="ignore", invalid="ignore"):
-            part = np.asarray(clouds[start : start + CHECKED], np.float32)  # as training reads them
+            part = np.asarray(clouds[start : start + step], np.float32)  # as training reads them
             length = np.sqrt(np.einsum("pnc,pnc->pn", part[..., 3:], part[..., 3:]))
             number = different(part[..., :3])
         good = {
@@ -272,8 +277,9 @@ def different(points: np.ndarray) -> np.ndarray:
 
 def check_edges(path: Path, edges: h5py.Dataset) -> None:
     """ValueError with the first patch whose rows of edges are neither points nor empty."""
-    for start in range(0, len(edges), CHECKED):
-        part = np.asarray(edges[start : start + CHECKED], float)
+    step = max(1, CHECKED // max(1, edges.shape[1]))
+    for start in range(0, len(edges), step):
+        part = np.asarray(edges[start : start + step], float)
         bad = ~(np.isfinite(part).all(2) | np.isnan(part).all(2)).all(1)
         if bad.any():
             raise ValueError(
