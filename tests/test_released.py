@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from pnu.models.pnu import PNU
-from pnu.models.released import from_released
+from pnu.networks.pnu import PNU
+from pnu.networks.released import from_released
 from torch import Tensor
 
 from bench.plain import PlainLoss, PlainPNU
