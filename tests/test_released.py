@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from pnu.networks.pnu import PNU
-from pnu.networks.released import from_released
 from torch import Tensor
 
 from bench.plain import PlainLoss, PlainPNU
 from pnu.losses import CompoundLoss
+from pnu.networks.pnu import PNU
+from pnu.networks.released import from_released
 from tests.released import FILE, POINTS, contents, digest, drawn_network, drawn_patch, loss_target, released
 
 
