@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import nn
 
-from pnu.run.build import is_within, present_name
+from pnu.runtime.targets import is_within, present_name
 
 
 def build(config: Mapping[str, Any], allow: Sequence[str] = ()) -> nn.Module:

@@ -5,6 +5,8 @@ import importlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from pnu.runtime.targets import is_within
+
 PACKAGES = {  # which may define the classes of a group; `allow` adds to them
     "data": ("pnu.data",),
     "model": ("pnu.networks",),
@@ -15,7 +17,6 @@ PACKAGES = {  # which may define the classes of a group; `allow` adds to them
     "callbacks": ("pnu.callbacks", "lightning.pytorch.callbacks"),
     "logger": ("lightning.pytorch.loggers",),
 }
-RENAMED = {"pnu.models.": "pnu.networks."}  # in the configs of older runs and weights
 NEEDS = {"WandbLogger": "wandb", "MLFlowLogger": "mlflow"}  # packages that loggers want, and the extras that have them
 LENGTH = "is the number of steps of the training; trainer.max_steps or trainer.max_epochs sets it"
 GIVEN = {  # arguments that the program gives, and why a config cannot
@@ -91,13 +92,3 @@ def find_class(target: str, within: str | Sequence[str], allow: Sequence[str] = 
     if not isinstance(found, type) or not any(is_within(found.__module__, package) for package in packages):
         raise ValueError(f"_target_={target}: expected a class of {' or '.join(packages)}")
     return found
-
-
-def present_name(target: str) -> str:
-    """The name that a class has now."""
-    return next((new + target.removeprefix(old) for old, new in RENAMED.items() if target.startswith(old)), target)
-
-
-def is_within(name: str, package: str) -> bool:
-    """Whether a dotted name is that of a package or below it."""
-    return bool(package) and f"{name}.".startswith(f"{package}.")

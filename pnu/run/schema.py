@@ -17,7 +17,7 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pnu.run.build import GIVEN, NEEDS, PACKAGES, is_within, present_name
+from pnu.run.build import GIVEN, NEEDS, PACKAGES
 from pnu.run.signature import (
     REQUIRED,
     Argument,
@@ -28,6 +28,7 @@ from pnu.run.signature import (
     first_sentence,
     members_of,
 )
+from pnu.runtime.targets import is_within, present_name
 
 PACKAGE = Path(__file__).resolve().parents[1]
 OWN = {  # keys of every group that are Hydra's
