@@ -15,7 +15,7 @@ class Report:
     """Compare the settings of a sweep over their seeds: Markdown, CSV and one HTML page."""
 
     sweep: str | None = doc("folder of the sweep; null: the newest below outputs/sweeps")
-    baseline: str | None = doc("name of the setting to compare with; null: that of the first job")
+    baseline: str | None = doc("name of the setting to compare with; null: that of the first job; a search has none")
     output: str | None = doc("folder of the report; null: <sweep>/report")
     quiet: bool = doc("print the page's path alone")
 

@@ -155,6 +155,23 @@ def test_effects_of_a_search_are_of_all_its_trials(make: Make) -> None:
     assert {key: len(pairs) for key, pairs in effects(collect(folder)).items()} == {"loss.w1": 6, "loss.w3": 6}
 
 
+def test_a_search_has_no_baseline(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
+    for job, w3 in enumerate([0.5, 0.1, 0.02]):
+        folder = make(job, None, 0, 0.3 - 0.1 * job, w3=w3)
+        config = yaml.safe_load((folder / f"{job}" / "config.yaml").read_text())
+        (folder / f"{job}" / "config.yaml").write_text(yaml.safe_dump(config | {"objective": ["chamfer_sq"]}))
+    study = collect(folder)
+    assert study.baseline is None
+    assert all(study.summary(setting, "chamfer_sq").difference is None for setting in study.settings)  # type: ignore[union-attr]
+    main([f"sweep={folder}"])
+    for name in ("report.md", "report.html", "settings.svg"):
+        assert "aseline" not in (folder / "report" / name).read_text(), name
+    text = (folder / "report" / "report.md").read_text()
+    assert "3 trials of a search, 1 seeds each" in text
+    assert "| 0 | loss.w3=0.5 | 300.000 | 27.0 | loss.w3=0.5 |" in text
+    assert collect(folder, "loss.w3=0.1").baseline is not None
+
+
 def test_terms_left_out_are_no_effect_of_a_number(make: Make) -> None:
     for job, loss in enumerate([{}, {"w3": 0.0}, {"w1": 0.0}, {"w1": 0.0, "w3": 0.0}]):
         folder = make(job, None, 0, 0.1 * job + 0.1, **loss)

@@ -58,7 +58,8 @@ def plots(study: Study) -> dict[str, Plot]:
     names = [setting.name for setting in study.settings]
     found = {
         "settings": plot(
-            "Each metric of each setting: a dot for each seed, a bar for the mean; the band is the baseline's spread",
+            "Each metric of each setting: a dot for each seed, a bar for the mean"
+            + ("" if study.search else "; the band is the baseline's spread"),
             [settings_panel(study, metric) for metric in study.metrics],
             names,
         )
@@ -155,7 +156,7 @@ def scaled(study: Study, metric: str, values: Iterable[float]) -> list[float]:
 
 def settings_panel(study: Study, metric: str) -> Panel:
     def draw(axes: "Axes") -> None:
-        summary = study.summary(study.baseline, metric)
+        summary = study.summary(study.baseline, metric) if study.baseline else None
         if summary is not None and summary.spread is not None:
             mean, spread = scaled(study, metric, [summary.mean, summary.spread])
             axes.axhspan(mean - spread, mean + spread, color="#dfe8f3", zorder=0)

@@ -65,15 +65,19 @@ class Setting(NamedTuple):
 
 
 class Study(NamedTuple):
-    """All settings in the order of their jobs, the baseline first; and the runs that have not finished."""
+    """All settings in the order of their jobs, the baseline first; and the runs that have not finished.
+
+    search: whether the settings are trials of a search, of which none is the one to compare with.
+    """
 
     folder: Path
     settings: Sequence[Setting]
     unfinished: Sequence[Run]
+    search: bool = False
 
     @property
-    def baseline(self) -> Setting:
-        return self.settings[0]
+    def baseline(self) -> Setting | None:
+        return None if self.search else self.settings[0]
 
     @property
     def described(self) -> dict[str, Any]:
@@ -92,7 +96,7 @@ class Study(NamedTuple):
 
     def summary(self, setting: Setting, metric: str) -> Summary | None:
         """None where the setting has no such metric."""
-        values, base = setting.of(metric), self.baseline.of(metric)
+        values, base = setting.of(metric), self.baseline.of(metric) if self.baseline else []
         if not values:
             return None
         spread = statistics.stdev(values) if len(values) > 1 else None
@@ -109,7 +113,7 @@ def collect(folder: str | Path, baseline: str | None = None) -> Study:
     """Read all runs below a sweep's folder.
 
     Args:
-        baseline: name of the setting to compare with; None: that of the first job.
+        baseline: name of the setting to compare with; None: that of the first job, or for a search none.
 
     Raises:
         ValueError: no finished run there, or no setting of that name.
@@ -130,7 +134,8 @@ def collect(folder: str | Path, baseline: str | None = None) -> Study:
             names = ", ".join(setting.name for setting in settings)
             raise ValueError(f"baseline={baseline}: expected one of {names}")
         settings = chosen + [setting for setting in settings if setting is not chosen[0]]
-    return Study(folder, settings, [run for run in found if not run.metrics])
+    search = baseline is None and any(run.config.get("objective") for run in finished)
+    return Study(folder, settings, [run for run in found if not run.metrics], search)
 
 
 def read(folder: RunFolder) -> Run:
@@ -174,10 +179,10 @@ def short(value: Any) -> str:
 def effects(study: Study) -> dict[str, list[tuple[float, Setting]]]:
     """For each key with numbers: the settings that differ from the baseline in it alone, by its value; the baseline
     among them. Where no two settings differ in one key alone (a search), all settings by every key."""
-    base = study.baseline.values
+    base = study.settings[0].values
     keys = [key for key in base if all(number(setting.values.get(key)) for setting in study.settings)]
     alone = {}
-    for key in keys:
+    for key in [] if study.search else keys:
         same = [s for s in study.settings if all(s.values.get(k) == v for k, v in base.items() if k != key)]
         if len(same) > 2 or len(same) == len(study.settings) > 1:
             alone[key] = by_value(key, same)

@@ -13,14 +13,15 @@ from pnu import page
 from pnu.io import atomic_path
 from pnu.run.provenance import provenance
 from pnu.run.quoting import retyped
+from pnu.run.sweep import runs_elsewhere, state
 from pnu.study.pictures import sheets
 from pnu.study.plots import Plot, plots
 from pnu.study.settings import Run, Setting, Study, short
 
-READING = (
-    "Mean and standard deviation over seeds of the test's metrics, each patch in its unit sphere. In brackets the"
-    " difference to the baseline; in bold where it is greater than the spread, the standard deviation of the difference"
-    " of two runs. With few seeds that is a hint, not a proof."
+READING = "Mean and standard deviation over seeds of the test's metrics, each patch in its unit sphere."
+COMPARED = (
+    " In brackets the difference to the baseline; in bold where it is greater than the spread, the standard deviation"
+    " of the difference of two runs. With few seeds that is a hint, not a proof."
 )
 
 
@@ -57,10 +58,10 @@ def facts(study: Study) -> list[str]:
     counts = sorted({len(setting.runs) for setting in study.settings})
     known = {key: [str(run.record[key]) for run in finished if run.record.get(key)] for key in ("git", "machine")}
     seeds = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
-    lines = [
-        f"{len(study.settings)} settings, {seeds} seeds each, {len(finished)} finished runs, {hours:.2f} hours.",
-        f"Baseline: {study.baseline.name}.",
-    ]
+    kind = "trials of a search" if study.search else "settings"
+    lines = [f"{len(study.settings)} {kind}, {seeds} seeds each, {len(finished)} finished runs, {hours:.2f} hours."]
+    if study.baseline:
+        lines.append(f"Baseline: {study.baseline.name}.")
     lines.append(provenance(counts, known["git"], known["machine"]))
     if study.unfinished:
         lines.append(f"{len(study.unfinished)} runs have not finished, see the end.")
@@ -68,7 +69,7 @@ def facts(study: Study) -> list[str]:
 
 
 def command_of(study: Study) -> str:
-    return retyped(str(study.baseline.runs[0].record.get("command", "")))
+    return retyped(str(study.settings[0].runs[0].record.get("command", "")))
 
 
 def cell(study: Study, setting: Setting, metric: str) -> tuple[str, str, bool]:
@@ -82,8 +83,15 @@ def cell(study: Study, setting: Setting, metric: str) -> tuple[str, str, bool]:
     return mean, difference, bool(summary.exceeds)
 
 
-def differing(setting: Setting, baseline: Setting) -> str:
-    """The keys in which a setting differs from the baseline; of a group with another class, the class alone."""
+def reading(study: Study) -> str:
+    return READING + COMPARED * (not study.search)
+
+
+def differing(setting: Setting, baseline: Setting | None) -> str:
+    """The keys in which a setting differs from the baseline; of a group with another class, the class alone. Without
+    baseline, all keys in which any setting differs."""
+    if baseline is None:
+        return ", ".join(f"{key}={short(value)}" for key, value in setting.values.items())
     keys = dict.fromkeys([*setting.values, *baseline.values])
     found = {key: setting.values.get(key, "-") for key in keys if setting.values.get(key) != baseline.values.get(key)}
     replaced = tuple(key.removesuffix("_target_") for key in found if key.endswith("._target_"))
@@ -96,10 +104,12 @@ def failures(study: Study) -> list[str]:
 
 
 def status(run: Run) -> str:
-    state = str(run.record.get("status", "no record"))
-    if state == "running":
+    found = state(run.folder)
+    if found == "running" and not runs_elsewhere(run.folder):  # on another machine, as far as its file system tells
         return "running, or ended without a word (kill, power cut); the same command goes on with it"
-    return f"{state}: {run.record.get('error', '')}"
+    return found + {"interrupted": "; the same command goes on with it", "running": ""}.get(
+        found, f": {run.record.get('error', '')}"
+    )
 
 
 def markdown(study: Study, drawn: Mapping[str, Plot], shapes: Sequence[str]) -> str:
@@ -108,7 +118,7 @@ def markdown(study: Study, drawn: Mapping[str, Plot], shapes: Sequence[str]) -> 
     if command := command_of(study):
         lines += ["```", command, "```", ""]
     lines += [
-        READING,
+        reading(study),
         "",
         f"| | setting | {' | '.join(study.shown(metric).title for metric in metrics)} | differs in |",
     ]
@@ -116,7 +126,7 @@ def markdown(study: Study, drawn: Mapping[str, Plot], shapes: Sequence[str]) -> 
     for i, setting in enumerate(study.settings):
         found = (cell(study, setting, metric) for metric in metrics)
         cells = [f"**{text}**" if beyond else text for text, beyond in ((f"{m} {d}".strip(), b) for m, d, b in found)]
-        differs = "baseline" if i == 0 else differing(setting, study.baseline)
+        differs = "baseline" if setting is study.baseline else differing(setting, study.baseline)
         lines.append(f"| {i} | {setting.name} | {' | '.join(cells)} | {differs} |")
     for name, plot in drawn.items():
         lines += ["", f"## {plot.caption}", "", f"![{plot.caption}]({name}.svg)"]
@@ -135,7 +145,7 @@ def page_html(study: Study, drawn: Mapping[str, Plot], pictures: Mapping[str, by
         title=study.folder.name,
         head=facts(study),
         command=command_of(study),
-        reading=READING,
+        reading=reading(study),
         settings=settings_table(study),
         plots=list(drawn.values()),
         pictures={shape: page.data_url(picture) for shape, picture in pictures.items()},
@@ -152,8 +162,8 @@ def settings_table(study: Study) -> page.Set:
             mean, difference, beyond = cell(study, setting, metric)
             key = page.sort_key(setting.mean(metric)) if setting.of(metric) else ""
             cells.append(page.Cell(mean, key, "beyond" if beyond else "", difference))
-        hint = "baseline" if i == 0 else differing(setting, study.baseline)
-        rows.append(page.Line(f"{i} {setting.name}", cells, i == 0, str(i), hint))
+        hint = "baseline" if setting is study.baseline else differing(setting, study.baseline)
+        rows.append(page.Line(f"{i} {setting.name}", cells, setting is study.baseline, str(i), hint))
     return page.Set("", "setting", [study.shown(metric).title for metric in study.metrics], rows)
 
 
