@@ -117,7 +117,7 @@ def test_the_search_for_commands_finds_them(tmp_path: Path) -> None:
 # where a line is made -> the test below that runs it
 PLACES = {
     "prepare.py next_line": "test_from_patches_to_a_picture",
-    "run/table.py closing": "test_from_patches_to_a_picture",
+    "run/folder.py line": "test_from_patches_to_a_picture",
     "upsample.py upsample": "test_from_patches_to_a_picture",
     "reconstruct.py reconstruct": "test_from_patches_to_a_picture",
     "export.py export": "test_weights_kept_as_a_file",
@@ -125,8 +125,8 @@ PLACES = {
     "evaluate.py evaluate": "test_an_evaluation_then_a_comparison",
     "compare.py compare": "test_an_evaluation_then_a_comparison",
     "compare.py upsamplers": "test_a_name_that_is_taken",
-    "run/folder.py recorded": "test_a_run_that_was_stopped",
     "run/resume.py open_run": "test_a_finished_run_that_lost_its_last_checkpoint",
+    "run/folder.py recorded": "test_a_run_that_was_stopped",
     "run/sweep.py closing": "test_a_sweep_then_its_report",
     "run/sweep.py run": "test_interrupted_with_a_launcher",  # in test_sweep.py
     "run/command.py main": "test_interrupted_before_anything_is_made",

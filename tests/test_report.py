@@ -168,7 +168,7 @@ def test_a_search_has_no_baseline(make: Make, capsys: pytest.CaptureFixture[str]
         assert "aseline" not in (folder / "report" / name).read_text(), name
     text = (folder / "report" / "report.md").read_text()
     assert "3 trials of a search, 1 seeds each" in text
-    assert "| 0 | loss.w3=0.5 | 300.000 | 27.0 | loss.w3=0.5 |" in text
+    assert "| 0 | loss.w3=0.5 | 300.0000 | 27.00 | loss.w3=0.5 |" in text
     assert collect(folder, "loss.w3=0.1").baseline is not None
 
 

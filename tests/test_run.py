@@ -172,23 +172,12 @@ def test_composing_leaves_hydra_as_it_was() -> None:
 SCRIPT = """
 from dataclasses import dataclass
 from pnu.run import command, doc
+from pnu.upsample import Upsample as Real
 
 @dataclass
-class Upsample:
+class Upsample(Real):
     "Densify a cloud."
-    input: str = doc("file to read")
-    output: str = doc("file to write")
-    run: str | None = doc("run folder")
     ratio: float = doc("points out for each point in")
-    normals: str = doc("")
-    patch_size: int | None = doc("")
-    batch_size: int | None = doc("")
-    device: str = doc("")
-    devices: int = doc("")
-    sample: int | None = doc("")
-    allow: list[str] = doc("")
-    seed: int = doc("")
-    quiet: bool = doc("")
 
 def work(cfg: Upsample) -> None:
     if cfg.ratio < 1:

@@ -81,7 +81,7 @@ class RunFolder:
 
     def line(self, verb: str, **keys: Any) -> str:
         """The command line of a command on this run."""
-        allow = {"allow": f"[{','.join(self.allow)}]"} if self.allow else {}
+        allow = {"allow": list(self.allow)} if self.allow else {}
         return shell_line(verb, **keys, run=self, **allow)
 
     @classmethod
