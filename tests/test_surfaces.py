@@ -162,8 +162,8 @@ def test_missing_open3d_has_its_own_exit_code(tmp_path: Path) -> None:
     ("change", "message"),
     [
         ({"depth": 0}, "depth=0: expected 1 to 16"),
-        ({"normals": np.zeros((200, 3))}, "200 of 200 normals have length zero"),
-        ({"points": np.full((200, 3), np.nan)}, "200 of 200 points hold NaN"),
+        ({"normals": np.zeros((200, 3))}, "has no normals; Poisson"),
+        ({"points": np.full((200, 3), np.nan)}, "200 of 200 points left out: NaN"),
         ({"points": np.ones((200, 3))}, "all 200 points are equal"),
     ],
 )
