@@ -27,8 +27,44 @@ def overview() -> str:
     width = max(map(len, known))
     lines = [f"  {verb:<{width}}  {line}" for verb, line in known.items()]
     return "\n".join(
-        ["usage: pnu VERB [key=value ...]", "", *lines, "", "pnu VERB --help explains its keys; pnu --version"]
+        [
+            "usage: pnu VERB [key=value ...]",
+            "",
+            *lines,
+            "",
+            "pnu VERB --help explains its keys; pnu --version",
+            "source <(pnu --completion bash), or zsh, completes them",
+        ]
     )
+
+
+def completion(shell: str) -> str:
+    """What a shell sources to complete verbs, and the keys of each: `source <(pnu --completion bash)`, or zsh."""
+    import yaml
+
+    from pnu.config.schema import config_folder
+
+    cases = []
+    for verb in verbs():
+        path = config_folder() / f"{verb}.yaml"
+        config = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        groups = [key for entry in config.pop("defaults", []) if isinstance(entry, dict) for key in entry]
+        keys = sorted({*config, *groups} - {"hydra"})
+        cases.append(f"    {verb}) words='--help {' '.join(f'{key}=' for key in keys)}' ;;")
+    known = " ".join(verbs())
+    lines = ["autoload -U +X bashcompinit && bashcompinit"] if shell == "zsh" else []
+    lines += [
+        "_pnu() {",
+        "  local words",
+        "  case ${COMP_WORDS[1]} in",
+        *cases,
+        "  esac",
+        f"  [ \"$COMP_CWORD\" -gt 1 ] || words='{known}'",
+        '  COMPREPLY=($(compgen -W "$words" -- "${COMP_WORDS[COMP_CWORD]}"))',
+        "}",
+        "complete -o nospace -o default -F _pnu pnu",
+    ]
+    return "\n".join(lines)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -39,6 +75,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(overview())
     elif verb == "--version":
         print(f"pnu {__version__}")
+    elif verb == "--completion" and rest in (["bash"], ["zsh"]):
+        print(completion(rest[0]))
     elif verb in verbs():
         sys.argv = [sys.argv[0], *rest]
         runpy.run_module(f"pnu.commands.{verb}", run_name="__main__", alter_sys=True)

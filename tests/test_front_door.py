@@ -1,0 +1,53 @@
+"""`pnu VERB`: verbs, mistakes, and what shells complete."""
+
+import subprocess
+import sys
+
+import pytest
+
+from pnu.__main__ import completion, main, verbs
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "pnu", *arguments], capture_output=True, text=True, check=False)
+
+
+def test_alone_it_lists_every_verb_with_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    main([])
+    out = capsys.readouterr().out
+    for verb, line in verbs().items():
+        assert line
+        assert f"  {verb}" in out
+
+
+def test_a_mistyped_verb_is_one_line() -> None:
+    done = run("upsamle", "input=x.ply")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "error: unknown verb 'upsamle': did you mean 'upsample'? `pnu` lists them\n"
+
+
+def test_the_module_that_trains_and_the_verb_are_one() -> None:
+    by_module = subprocess.run(
+        [sys.executable, "-m", "pnu.train", "--help"], capture_output=True, text=True, check=True
+    )
+    by_verb = run("train", "--help")
+    assert by_verb.stdout.startswith("usage: pnu train")
+    assert by_module.stdout.splitlines()[1:] == by_verb.stdout.splitlines()[1:]
+
+
+@pytest.mark.parametrize(
+    ("typed", "expected"),
+    [
+        ("up", ["upsample"]),
+        ("re", ["reconstruct", "report"]),
+        ("upsample rat", ["ratio="]),
+        ("train sched", ["scheduler="]),
+    ],
+)
+def test_a_shell_completes_verbs_and_keys(typed: str, expected: list[str]) -> None:
+    words = ["pnu", *typed.split()]
+    script = f"{completion('bash')}\nCOMP_WORDS=({' '.join(words)}); COMP_CWORD={len(words) - 1}; _pnu\n"
+    done = subprocess.run(
+        ["bash", "-c", script + 'printf "%s\\n" "${COMPREPLY[@]}"'], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == expected
