@@ -81,11 +81,11 @@ def test_names_of_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folders = [tmp_path / "12-30-01_wide", tmp_path / "12-31-01_wide", tmp_path / "12-32-01_deep"]
     for folder in folders:
         folder.mkdir()
-    monkeypatch.setattr("pnu.networks.checkpoints.load", lambda folder: None)
+    monkeypatch.setattr("pnu.networks.checkpoints.load", lambda folder, allow: None)
     monkeypatch.setattr("pnu.benchmark.network_upsampler", lambda *args, **options: None)
     from omegaconf import OmegaConf
 
-    keys = {"ratio": 4, "passes": False, "batch_size": None, "device": "cpu", "seed": 0}
+    keys = {"ratio": 4, "passes": False, "batch_size": None, "device": "cpu", "seed": 0, "allow": []}
     cfg = OmegaConf.create({"methods": [str(folder) for folder in folders]} | keys)
     monkeypatch.setattr("pnu.commands.compare.runs_of_sweep", lambda method: [])
     assert list(upsamplers(cfg)) == ["12-30-01_wide", "12-31-01_wide", "deep"]

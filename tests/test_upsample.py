@@ -184,7 +184,7 @@ def test_help_names_every_key(tmp_path: Path) -> None:
 def test_long_runs_keep_parts_until_the_output_is_there(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from pnu import io
 
-    module = importlib.import_module("pnu.upsample")  # whose name in the package is the function until then
+    module = importlib.import_module("pnu.commands.upsample")
     monkeypatch.chdir(place)
     monkeypatch.setattr(module, "LONG", 100)
     parts = place / "dense.ply.parts"
