@@ -12,7 +12,7 @@ import yaml
 
 import pnu
 from pnu.commands.train import Train, main
-from pnu.config import compose_config
+from pnu.config.compose import compose_config
 from pnu.config.help_text import help_text
 from pnu.networks.checkpoints import read
 from tests.commands import refused

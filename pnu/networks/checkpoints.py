@@ -33,11 +33,11 @@ NEWEST = "newest"  # instead of a run folder
 def load(source: str | PathLike[str], allow: Sequence[str] = ()) -> nn.Module:
     """The trained network of a run folder, of a file of weights, or of that shipped name, on the CPU, in eval mode.
 
-    Args:
-        allow: packages of your own whose networks may be built too; they run their code. A run's own config has no say.
-
     "newest" is the run that finished last under outputs/. Generators and settings of torch are left alone, and have no
     influence.
+
+    Args:
+        allow: packages of your own whose networks may be built too; they run their code. A run's own config has no say.
 
     Raises:
         ValueError: no run folder, or its config or checkpoint are not those of a network of ours.
@@ -45,7 +45,7 @@ def load(source: str | PathLike[str], allow: Sequence[str] = ()) -> nn.Module:
     source = resolve(source)
     if (file := weights.find(source)) is not None:
         model, points, tensors = weights.read(file)
-        network = _unfilled(model)
+        network = _unfilled(model, allow)
         if points is not None:
             network.patch_size = points  # type: ignore[assignment]
         fill(network, tensors, file)
@@ -57,7 +57,7 @@ def load(source: str | PathLike[str], allow: Sequence[str] = ()) -> nn.Module:
             f" ({', '.join(weights.names())}), found no folder"
         )
     config = run_config(folder)
-    network = _unfilled(config["model"])
+    network = _unfilled(config["model"], allow)
     points = config["data"].get("input_points") if isinstance(config.get("data"), dict) else None
     if isinstance(points, int):
         network.patch_size = points  # type: ignore[assignment]  # radii are fractions of a patch: what it was trained on
@@ -78,10 +78,10 @@ def resolve(source: str | PathLike[str]) -> str | PathLike[str]:
     return run
 
 
-def _unfilled(config: Mapping[str, Any]) -> nn.Module:
+def _unfilled(config: Mapping[str, Any], allow: Sequence[str]) -> nn.Module:
     """The network of a config, to be filled, in float32; what it draws at first leaves no trace in the generator."""
     with torch.device("cpu"), torch.random.fork_rng(devices=[]):
-        return networks.build_network(config).float()
+        return networks.build_network(config, allow).float()
 
 
 def run_config(folder: Path) -> dict[str, Any]:
