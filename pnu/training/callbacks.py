@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import os
 import time
 from collections.abc import Mapping
 from datetime import timedelta
@@ -427,7 +428,10 @@ def build_loggers(config: Mapping[str, Any], run: RunFolder) -> list[Logger]:
         more: dict[str, Any] = purge if kind == "TensorBoardLogger" else {}
         if kind == "CSVLogger":  # which would write over what it has
             group = {**group, "version": unused_name(run.path / (group.get("name") or ""), str(group.get("version")))}
-        folder = run.path.absolute() / "mlflow" if kind == "MLFlowLogger" else run.path
+        folder = run.path
+        if kind == "MLFlowLogger":
+            folder = run.path.absolute() / "mlflow"
+            os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")  # later versions want a database otherwise
         found.append(
             instantiate(group, PACKAGES["logger"], allow=config.get("allow") or (), save_dir=str(folder), **more)
         )
