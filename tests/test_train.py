@@ -81,6 +81,11 @@ def events(run: Path) -> EventAccumulator:
     return accumulator.Reload()
 
 
+def scalars(run: Path, name: str) -> list[tuple[int, float]]:
+    """Steps and values of a curve, by step: files of one second come in the order of their names, .10 before .9."""
+    return sorted((event.step, event.value) for event in events(run).Scalars(name))
+
+
 # --- the run folder ---
 
 
@@ -170,18 +175,18 @@ def test_metrics_of_untrained_best_and_test(finished: Path) -> None:
         assert names <= set(section)
         assert all(np.isfinite(section[name]) for name in names)
     assert metrics["validation"]["step"] in (4, 8)
-    values = [event.value for event in events(finished).Scalars("val/chamfer_sq")]
+    values = [value for _, value in scalars(finished, "val/chamfer_sq")]
     assert metrics["untrained"]["chamfer_sq"] == pytest.approx(values[0])
     assert metrics["validation"]["chamfer_sq"] == pytest.approx(min(values[1:]))
 
 
 def test_tensorboard_has_curves_clouds_pictures_config_and_hparams(finished: Path) -> None:
     found = events(finished)
-    scalars = found.Tags()["scalars"]
+    names = found.Tags()["scalars"]
     for name in ("cd", "point_knn", "normal", "normal_orth", "normal_knn", "loss", "lr", "gradient_norm"):
-        assert [event.step for event in found.Scalars(f"train/{name}")] == list(range(8))
-    assert [event.step for event in found.Scalars("val/chamfer_sq")] == [0, 3, 7]
-    assert {"test/chamfer_sq", "test/normal_deg", "val/spacing_cv"} <= set(scalars)
+        assert [step for step, _ in scalars(finished, f"train/{name}")] == list(range(8))
+    assert [step for step, _ in scalars(finished, "val/chamfer_sq")] == [0, 3, 7]
+    assert {"test/chamfer_sq", "test/normal_deg", "val/spacing_cv"} <= set(names)
     (shape,) = found.Tags()["images"]
     assert shape.startswith("ellipsoid_")
     tensors = set(found.Tags()["tensors"])
@@ -319,7 +324,7 @@ def test_a_run_goes_on_from_every_checkpoint_as_if_never_stopped(
         )
         assert (copy / "metrics.json").read_text() == (whole / "metrics.json").read_text()
         for name in ("train/loss", "train/lr", "val/chamfer_sq"):
-            ours, theirs = (sorted((e.step, e.value) for e in events(run).Scalars(name)) for run in (copy, whole))
+            ours, theirs = (scalars(run, name) for run in (copy, whole))
             assert ours == theirs, (copy, name)
 
 
@@ -530,7 +535,7 @@ def test_every_choice_trains_a_step(train: Train, choice: str) -> None:
 def test_onecycle_without_warm_up(train: Train) -> None:
     """Two steps of which half are warm-up: torch alone divides by the length of the warm-up, 1 - 1."""
     run = train("scheduler=onecycle", "scheduler.pct_start=0.5", "trainer.max_steps=2", "trainer.max_epochs=1")
-    first, last = (event.value for event in events(run).Scalars("train/lr"))
+    first, last = (value for _, value in scalars(run, "train/lr"))
     assert 1e-3 > first > last
 
 
