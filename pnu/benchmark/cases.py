@@ -76,7 +76,8 @@ def draw_input(truth: Truth, kind: str, n: int, rng: np.random.Generator) -> np.
         draws = torch.Generator().manual_seed(int(rng.integers(2**62)))
         places = torch.from_numpy(dense[None, :, :3])
         idx = nonuniform_points(places, n, strength=STRENGTH, centers=CENTERS, generator=draws)
-        return dense[idx[0].numpy()]
+        drawn: np.ndarray = dense[idx[0].numpy()]
+        return drawn
     cloud = sample_poisson_disk(truth.mesh, n // 4 if kind == "sparse" else n, rng)
     if kind.startswith("noise_"):
         cloud[:, :3] += rng.normal(scale=float(kind.removeprefix("noise_")) / 100, size=(n, 3))

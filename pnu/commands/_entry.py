@@ -47,7 +47,6 @@ from pnu.config.compose import (
     check_single,
     checked,
     composer,
-    config_folder,
     fitted,
     in_multirun,
     one_line,
@@ -56,7 +55,7 @@ from pnu.config.compose import (
     variations,
 )
 from pnu.config.help_text import help_text
-from pnu.config.schema import checked_config, fields
+from pnu.config.schema import checked_config, config_folder, fields
 from pnu.training import optuna_search, sweeps
 from pnu.training.run_folder import INTERRUPTED, is_main_process
 

@@ -29,7 +29,8 @@ def ellipsoid(center: ArrayLike, radii: ArrayLike, rotation: np.ndarray | None =
     def field(p: np.ndarray) -> np.ndarray:
         q = (p - center) if rotation is None else (p - center) @ rotation
         k = np.linalg.norm(q / radii, axis=1)
-        return k * (k - 1) / np.maximum(np.linalg.norm(q / radii**2, axis=1), 1e-9)
+        distance: np.ndarray = k * (k - 1) / np.maximum(np.linalg.norm(q / radii**2, axis=1), 1e-9)
+        return distance
 
     return field
 
@@ -41,7 +42,8 @@ def capsule(start: ArrayLike, end: ArrayLike, radius: float, end_radius: float |
 
     def field(p: np.ndarray) -> np.ndarray:
         t = np.clip((p - start) @ axis / (axis @ axis), 0, 1)
-        return np.linalg.norm(p - start - t[:, None] * axis, axis=1) - (radius + slope * t)
+        distance: np.ndarray = np.linalg.norm(p - start - t[:, None] * axis, axis=1) - (radius + slope * t)
+        return distance
 
     return field
 
@@ -60,7 +62,8 @@ def torus(center: ArrayLike, major: float, minor: float, axis: int = 2) -> Field
     def field(p: np.ndarray) -> np.ndarray:
         q = p - center
         ring = np.linalg.norm(np.delete(q, axis, axis=1), axis=1) - major
-        return np.hypot(ring, q[:, axis]) - minor
+        distance: np.ndarray = np.hypot(ring, q[:, axis]) - minor
+        return distance
 
     return field
 
@@ -73,7 +76,8 @@ def union(*fields: Field, k: float = 0.0) -> Field:
     def field(p: np.ndarray) -> np.ndarray:
         values = np.stack([f(p) for f in fields])
         low = values.min(axis=0)
-        return low - k * np.log(np.exp((low - values) / k).sum(axis=0))
+        blended: np.ndarray = low - k * np.log(np.exp((low - values) / k).sum(axis=0))
+        return blended
 
     return field
 

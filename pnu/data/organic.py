@@ -152,7 +152,10 @@ def cactus() -> Mesh:
     """A cactus, around the origin."""
 
     def ribs(p: np.ndarray) -> np.ndarray:
-        return 0.018 * np.cos(10 * np.arctan2(p[:, 1], p[:, 0])) * np.minimum(np.hypot(p[:, 0], p[:, 1]) / 0.15, 1)
+        depth: np.ndarray = (
+            0.018 * np.cos(10 * np.arctan2(p[:, 1], p[:, 0])) * np.minimum(np.hypot(p[:, 0], p[:, 1]) / 0.15, 1)
+        )
+        return depth
 
     trunk = capsule((0, 0, -0.7), (0, 0, 0.7), 0.2, 0.19)
     arms = [polyline(np.array([[0.1, 0, -0.1], [0.45, 0, 0], [0.5, 0, 0.4]]), [0.1, 0.11, 0.1]),
@@ -252,7 +255,10 @@ def pear() -> Mesh:
 
     def radius(d: np.ndarray) -> np.ndarray:
         z = d[:, 2]
-        return 0.62 + 0.25 * np.clip(z, 0, 1) ** 2 - 0.12 * np.sin(2.2 * z) - 0.1 * np.exp(-((z + 1) ** 2) / 0.02)
+        r: np.ndarray = (
+            0.62 + 0.25 * np.clip(z, 0, 1) ** 2 - 0.12 * np.sin(2.2 * z) - 0.1 * np.exp(-((z + 1) ** 2) / 0.02)
+        )
+        return r
 
     return star_shaped(radius)
 
@@ -270,7 +276,8 @@ def pumpkin() -> Mesh:
     def radius(d: np.ndarray) -> np.ndarray:
         rim = np.hypot(d[:, 0], d[:, 1])
         ribs = np.abs(np.cos(5 * np.arctan2(d[:, 1], d[:, 0]))) ** 0.7
-        return (0.62 + 0.3 * rim**2) * (1 - 0.13 * rim * (1 - ribs)) - 0.15 * np.exp((d[:, 2] - 1) / 0.05)
+        r: np.ndarray = (0.62 + 0.3 * rim**2) * (1 - 0.13 * rim * (1 - ribs)) - 0.15 * np.exp((d[:, 2] - 1) / 0.05)
+        return r
 
     return star_shaped(radius, 240)
 
@@ -320,7 +327,8 @@ def starfish() -> Mesh:
     def body(p: np.ndarray) -> np.ndarray:
         a, r = np.arctan2(p[:, 1], p[:, 0]), np.hypot(p[:, 0], p[:, 1])
         reach = 0.42 + 0.36 * np.cos(5 * a) * np.minimum(r / 0.3, 1)
-        return 0.5 * (np.hypot(r / np.maximum(reach, 0.05) * 0.5, p[:, 2] / 0.26 * 0.5) - 0.5)
+        distance: np.ndarray = 0.5 * (np.hypot(r / np.maximum(reach, 0.05) * 0.5, p[:, 2] / 0.26 * 0.5) - 0.5)
+        return distance
 
     bumps = waves(3, 14, 22)
     return surface_nets(lambda p: body(p) + 0.006 * bumps(p), [0.95, 0.95, 0.4])
@@ -433,7 +441,8 @@ def gyroid(level: float = 0.35) -> Mesh:
     def sheet(p: np.ndarray) -> np.ndarray:
         x, y, z = (4.4 * p).T
         value = np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
-        return (np.abs(value) - level) / 6
+        distance: np.ndarray = (np.abs(value) - level) / 6
+        return distance
 
     return surface_nets(cut(sheet, lambda p: 0.85 - np.linalg.norm(p, axis=1), k=0.01), 0.95, 80)
 
@@ -442,10 +451,12 @@ def lattice() -> Mesh:
     """Schwarz P body in a rounded box: a smooth foam of pipes."""
 
     def pipes(p: np.ndarray) -> np.ndarray:
-        return np.cos(5.2 * p).sum(1) / 6 + 0.05
+        distance: np.ndarray = np.cos(5.2 * p).sum(1) / 6 + 0.05
+        return distance
 
     def outside(p: np.ndarray) -> np.ndarray:
-        return 0.75 - (p**8).sum(1) ** (1 / 8)
+        distance: np.ndarray = 0.75 - (p**8).sum(1) ** (1 / 8)
+        return distance
 
     return surface_nets(cut(pipes, outside, k=0.02), 0.9, 80)
 
@@ -457,7 +468,8 @@ def cloth() -> Mesh:
     def sheet(p: np.ndarray) -> np.ndarray:
         height = p[:, 2] - 0.13 * fold(p * [1, 1, 0]) + 0.35 * (p[:, 0] ** 2 + p[:, 1] ** 2)
         side = np.hypot(p[:, 0], p[:, 1]) - 0.85
-        return np.hypot(np.maximum(side, 0), 0.75 * height) - 0.045
+        distance: np.ndarray = np.hypot(np.maximum(side, 0), 0.75 * height) - 0.045
+        return distance
 
     return surface_nets(sheet, [1, 1, 0.85], 90)
 
@@ -477,7 +489,8 @@ def drum(radius: float, half: float, edge: float) -> Field:
 
     def field(p: np.ndarray) -> np.ndarray:
         q = np.stack([np.hypot(p[:, 0], p[:, 1]) - radius + edge, np.abs(p[:, 2]) - half + edge])
-        return np.linalg.norm(np.maximum(q, 0), axis=0) + np.minimum(q.max(0), 0) - edge
+        distance: np.ndarray = np.linalg.norm(np.maximum(q, 0), axis=0) + np.minimum(q.max(0), 0) - edge
+        return distance
 
     return field
 

@@ -13,7 +13,8 @@ from pnu.io import Mesh
 def smooth_curve(control: np.ndarray, samples: int) -> np.ndarray:
     """Monotone cubic through control points (m, d), evenly sampled in chord length: (samples, d); never overshoots."""
     chord = np.concatenate([[0], np.linalg.norm(np.diff(control, axis=0), axis=1).cumsum()])
-    return PchipInterpolator(chord, control)(np.linspace(0, chord[-1], samples))
+    curve: np.ndarray = PchipInterpolator(chord, control)(np.linspace(0, chord[-1], samples))
+    return curve
 
 
 def revolution(control: list[tuple[float, float]], segments: int = 128, samples: int = 160) -> Mesh:

@@ -274,7 +274,8 @@ def different(points: np.ndarray) -> np.ndarray:
     """How many different points each cloud of (p, n, 3) float32 has, (p,)."""
     bits = (points + np.float32(0)).view(np.uint32).astype(np.uint64)  # -0 becomes 0
     keys = bits @ np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
-    return 1 + (np.diff(np.sort(keys, axis=1), axis=1) != 0).sum(1)
+    count: np.ndarray = 1 + (np.diff(np.sort(keys, axis=1), axis=1) != 0).sum(1)
+    return count
 
 
 def check_edges(path: Path, edges: h5py.Dataset) -> None:
@@ -324,7 +325,8 @@ def dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset | None:
 
 def is_own(file: h5py.File, name: str) -> bool:
     """Whether an entry of a file is its own, and no link that may lead to another file."""
-    return file.id.links.get_info(name.encode()).type == h5py.h5l.TYPE_HARD
+    hard: bool = file.id.links.get_info(name.encode()).type == h5py.h5l.TYPE_HARD
+    return hard
 
 
 def parameters_of(file: h5py.File) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Weighted sums of rows with a fast, repeatable gradient."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,8 @@ def combine(features: Tensor, idx: Tensor, weight: Tensor | None = None) -> Tens
     one fixed order and needs no atomic additions.
     """
     if features.device.type == "cpu" and features.dtype == torch.float32:
-        return _Combine.apply(features, idx, weight)
+        apply: Callable[..., Tensor] = _Combine.apply
+        return apply(features, idx, weight)
     rows = features[idx.flatten()].view(*idx.shape, -1)
     return rows.sum(1) if weight is None else (rows * weight[..., None]).sum(1)
 

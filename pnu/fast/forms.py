@@ -54,7 +54,8 @@ def through(
 
 def from_products(layer: layers.Layer, products: Tensor) -> Tensor:
     """A layer from the products of its input (R, C) with its weight, without bias."""
-    return layer.norm(products if layer.linear.bias is None else products + layer.linear.bias).relu()
+    rows: Tensor = layer.norm(products if layer.linear.bias is None else products + layer.linear.bias)
+    return rows.relu()
 
 
 def stacked(mlp: layers.MLP) -> Sequence[layers.Layer]:

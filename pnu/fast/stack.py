@@ -18,7 +18,7 @@ Results are those of the plain layers to rounding, and the same bit for bit in e
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -55,7 +55,8 @@ def train(
     weights = [None if projected and i == 0 else layer.linear.weight for i, layer in enumerate(layers)]
     biases = [layer.linear.bias for layer in layers]
     scales, shifts = [layer.norm.weight for layer in layers], [layer.norm.bias for layer in layers]
-    return _Stack.apply(x, centers, layers, groups, *weights, *biases, *scales, *shifts)
+    apply: Callable[..., Tensor] = _Stack.apply
+    return apply(x, centers, layers, groups, *weights, *biases, *scales, *shifts)
 
 
 def _sign(norm: BatchNorm) -> Tensor:

@@ -18,16 +18,16 @@ def carry(dense: np.ndarray, sparse: np.ndarray, values: np.ndarray) -> np.ndarr
     dist, idx = cKDTree(sparse[:, :3]).query(dense[:, :3], k=np.arange(1, k + 1))
     cosine = (dense[:, None, 3:] * sparse[idx, 3:6]).sum(-1)
     alike = cosine > SAME_SIDE
-    nearest = idx[np.arange(len(dense)), alike.argmax(1)]  # the first of all where none is alike
     if not (np.issubdtype(values.dtype, np.number) and not np.issubdtype(values.dtype, np.complexfloating)):
-        return values[nearest]
+        nearest: np.ndarray = values[idx[np.arange(len(dense)), alike.argmax(1)]]  # the first where none is alike
+        return nearest
     alike &= alike.cumsum(1) <= NEIGHBORS
     floor = 1e-12 * max(float(np.square(dist[:, -1]).mean()), np.finfo(float).tiny)
     weight = np.where(alike, cosine, 0) / (dist**2 + floor)
     lost = ~alike.any(1)
     weight[lost, 0] = 1
     weight /= weight.sum(1, keepdims=True)
-    mean = np.einsum("mk,mk...->m...", weight, values[idx].astype(np.float64))
+    mean: np.ndarray = np.einsum("mk,mk...->m...", weight, values[idx].astype(np.float64))
     if np.issubdtype(values.dtype, np.integer):
         mean = mean.round()
     return mean.astype(values.dtype)

@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pnu.geometry.noise_level import noise_level
@@ -56,7 +55,7 @@ class CloudStatistics(NamedTuple):
         return found
 
 
-def describe_cloud(points: NDArray, normals: NDArray | None = None) -> CloudStatistics:
+def describe_cloud(points: np.ndarray, normals: np.ndarray | None = None) -> CloudStatistics:
     """Spacing and noise of a cloud (n, 3), n >= 16; normals (n, 3) tell the sides of thin walls apart."""
     k = min(NEIGHBORS, len(points) - 1)
     far = cKDTree(points).query(points[:: -(-len(points) // PLACES)], k=[k + 1])[0]
@@ -69,7 +68,7 @@ def describe_cloud(points: NDArray, normals: NDArray | None = None) -> CloudStat
     return CloudStatistics(dense, middle, sparse, noise, radius, against, *far_points(points))
 
 
-def contradicting(points: NDArray, normals: NDArray) -> float:
+def contradicting(points: np.ndarray, normals: np.ndarray) -> float:
     """Share of pairs of neighbors (at most 4000 places, 6 each) whose unit normals (n, 3) contradict each other.
 
     Normals of a pair contradict where they differ by more than 120 degrees though the pair lies along the surface of
@@ -89,7 +88,7 @@ def contradicting(points: NDArray, normals: NDArray) -> float:
     return float(min(2 * towards.sum() + even.sum(), against.sum()) / max(counted.sum(), 1))
 
 
-def far_points(points: NDArray) -> tuple[int, int]:
+def far_points(points: np.ndarray) -> tuple[int, int]:
     """How many points lie farther from their fourth neighbor than 99 % of them reach, and the row of the farthest."""
     distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     reach = float(np.quantile(distance, 0.99))

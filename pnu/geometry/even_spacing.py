@@ -35,7 +35,7 @@ def tangent_discs(points: Tensor, normals: Tensor, count: int, *, rank: int = RA
     across = torch.linalg.cross(normals, along)
     seed = torch.arange(count, device=points.device, dtype=points.dtype)
     discs = points.new_empty(len(points), count, 3)
-    for part in torch.arange(len(points), device=points.device).split(max(ROWS // count, 1)):
+    for part in torch.split(torch.arange(len(points), device=points.device), max(ROWS // count, 1)):
         point = part[:, None].to(points.dtype)
         share = (seed + (point * (1 / GOLDEN_ANGLE)).frac()) / count
         angle = GOLDEN_ANGLE * (seed + count * point)
@@ -55,7 +55,7 @@ def repel(points: Tensor, normals: Tensor, *, steps: int, neighbors: int = 8, st
     a cloud does not grow beyond its border. Points of sheets that look opposite ways ignore each other.
     """
     m, k = len(points), min(neighbors + 1, len(points))
-    parts = torch.arange(m, device=points.device).split(ROWS)
+    parts = torch.split(torch.arange(m, device=points.device), ROWS)
     dist, idx = points.new_empty(m, k - 1), torch.empty(m, k - 1, dtype=torch.int32, device=points.device)
     done, total = 0, steps * len(parts)
     step(0, total)

@@ -45,7 +45,8 @@ class Decline(NamedTuple):
         if distance <= 0:
             return self.most
         if distance < self.distance[-1]:
-            return min(self.number[-1] * min(self.distance[-1] / distance, 1e6) ** 2, self.most)
+            beyond: float = min(self.number[-1] * min(self.distance[-1] / distance, 1e6) ** 2, self.most)
+            return beyond
         return float(np.interp(-distance, -self.distance, self.number))
 
 

@@ -15,14 +15,16 @@ if TYPE_CHECKING:
 
 def face_areas(mesh: Mesh) -> np.ndarray:
     """Area of each face, (f,), in the mesh's unit squared."""
-    return 0.5 * np.linalg.norm(_cross(mesh), axis=1)
+    areas: np.ndarray = 0.5 * np.linalg.norm(_cross(mesh), axis=1)
+    return areas
 
 
 def face_normals(mesh: Mesh) -> np.ndarray:
     """Unit normal of each face, (f, 3), counter-clockwise side; zero for a face without area."""
     cross = _cross(mesh)
     length = np.linalg.norm(cross, axis=1, keepdims=True)
-    return np.divide(cross, length, out=np.zeros_like(cross), where=length > 0)
+    unit: np.ndarray = np.divide(cross, length, out=np.zeros_like(cross), where=length > 0)
+    return unit
 
 
 def signed_volume(mesh: Mesh) -> float:
@@ -45,7 +47,8 @@ def sample_area(mesh: Mesh, n: int, rng: np.random.Generator) -> np.ndarray:
 def sample_poisson_disk(mesh: Mesh, n: int, rng: np.random.Generator) -> np.ndarray:
     """Exactly n evenly spread points (blue noise) with normals, (n, 6): farthest points of a dense area sample."""
     dense = sample_area(mesh, 8 * n, rng)
-    return dense[farthest_points_large(dense[:, :3], n)]
+    even: np.ndarray = dense[farthest_points_large(dense[:, :3], n)]
+    return even
 
 
 def closest_points(mesh: Mesh, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -22,7 +22,8 @@ def vertex_normals(mesh: Mesh) -> NDArray[np.float64]:
     sums = [np.bincount(mesh.faces.ravel(), column, len(mesh.vertices)) for column in weighted.T]
     total = np.stack(sums, axis=1)
     length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.divide(total, length, out=np.zeros_like(total), where=length > 0)
+    unit: NDArray[np.float64] = np.divide(total, length, out=np.zeros_like(total), where=length > 0)
+    return unit
 
 
 def corner_normals(mesh: Mesh, smooth: bool = True) -> NDArray[np.float64]:

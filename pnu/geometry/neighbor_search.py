@@ -84,7 +84,8 @@ def ball_query(query: Tensor, target: Tensor, radius: float, k: int) -> Tensor:
         return _ball_tree(query, target, radius, k)
     triton_kernels = gpu_kernels(query)
     if triton_kernels and k <= KERNEL_K:
-        return triton_kernels.ball_query(*_single(query, target), radius, k)
+        idx: Tensor = triton_kernels.ball_query(*_single(query, target), radius, k)
+        return idx
     return _ball_chunks(query, target, radius, k)
 
 
@@ -180,7 +181,8 @@ def _knn_kernel(kernels: ModuleType, query: Tensor, target: Tensor, k: int) -> N
         return Neighbors(dist_sq.to(query.dtype), idx)
     batch = torch.arange(len(idx), device=idx.device)[:, None, None]
     parts = []
-    for part in torch.arange(query.shape[1], device=idx.device).split(max(1, CHUNK_ELEMENTS // (3 * k * len(idx)))):
+    size = max(1, CHUNK_ELEMENTS // (3 * k * len(idx)))
+    for part in torch.split(torch.arange(query.shape[1], device=idx.device), size):
         parts.append((query[:, part, None] - target[batch, idx[:, part]]).square_().sum(-1))
     dist_sq, order = torch.cat(parts, 1).sort(dim=-1, stable=True)
     return Neighbors(dist_sq.to(query.dtype), idx.gather(-1, order))

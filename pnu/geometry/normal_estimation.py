@@ -66,7 +66,7 @@ def flip_to_reference(normals: Tensor, points: Tensor, ref_points: Tensor, ref_n
 def _plane_normals(points: Tensor, idx: Tensor, weight: Tensor | None = None) -> Tensor:
     """Direction of least variance of points[idx], (n, 3); idx (n, k), weights (n, k)."""
     normals = []
-    for rows in torch.arange(len(idx), device=idx.device).split(ROWS):
+    for rows in torch.split(torch.arange(len(idx), device=idx.device), ROWS):
         near = points[idx[rows]].double()
         share = torch.ones_like(near[..., :1]) if weight is None else weight[rows, :, None].double()
         near = near - (share * near).sum(1, keepdim=True) / share.sum(1, keepdim=True)
@@ -91,7 +91,7 @@ def _sheet_normals(cloud: Cloud, normals: Tensor, noise: float) -> Tensor:
     """Plane fits to the neighbors that face the same way and lie near the tangent plane, signs kept."""
     k = round(32 * min(1 + 3 * noise, 1.5))
     fitted = []
-    for rows in torch.arange(len(normals), device=normals.device).split(ROWS):
+    for rows in torch.split(torch.arange(len(normals), device=normals.device), ROWS):
         idx, normal = cloud.idx[rows, :k], normals[rows, None]
         offset = cloud.points[idx] - cloud.points[rows, None]
         distance = offset.norm(dim=-1)

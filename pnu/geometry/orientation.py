@@ -68,7 +68,7 @@ def _global_signs(cloud: Cloud, lines: Tensor) -> Tensor:
     areas = _least_squares(layer, 0.5 * weight, 4)
 
     def misfit(sign: Tensor) -> float:
-        return ((layer @ (sign * weight) - 0.5 * weight).norm() / (0.5 * weight).norm()).item()
+        return float((layer @ (sign * weight) - 0.5 * weight).norm() / (0.5 * weight).norm())
 
     # narrow dipoles keep thin walls apart, wide ones see past noise: Gauss' law tells which did better
     sign = min((_settled(_dipoles(cloud, lines, width), _sign(areas))[0] for width in (1.0, 1.4, 2.0)), key=misfit)
@@ -109,7 +109,7 @@ def _sign(values: Tensor) -> Tensor:
 
 def _blocks(lines: Tensor) -> tuple[Tensor, ...]:
     """Rows of a matrix of all pairs, few enough for a processor's cache."""
-    return torch.arange(len(lines), device=lines.device).split(128)
+    return torch.split(torch.arange(len(lines), device=lines.device), 128)
 
 
 def _layer(cloud: Cloud, lines: Tensor, rows: Tensor) -> Tensor:
@@ -190,7 +190,7 @@ def field(cloud: Cloud, normals: Tensor, noise: float) -> Tensor:
     """Minus the gradient of the neighbors' winding number at each point, as unit vectors (n, 3)."""
     width = 1 + 3 * noise
     out = []
-    for rows in torch.arange(len(normals), device=normals.device).split(ROWS):
+    for rows in torch.split(torch.arange(len(normals), device=normals.device), ROWS):
         idx = cloud.idx[rows, 1:]
         offset = cloud.points[idx] - cloud.points[rows, None]
         width_sq = width**2 * (cloud.spacing[rows, None] ** 2 + cloud.spacing[idx] ** 2) / 2

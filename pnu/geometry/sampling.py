@@ -37,7 +37,8 @@ def farthest_points(points: Tensor, m: int, *, start: int | Tensor = 0, skip_nea
         first = first.to(points.device)
         kernels = gpu_kernels(xyz)
         if kernels and n <= kernels.FARTHEST_LIMIT:
-            return kernels.farthest_points(xyz, m, first, NEAR_ORIGIN_SQ if skip_near_origin else -1.0)
+            idx: Tensor = kernels.farthest_points(xyz, m, first, NEAR_ORIGIN_SQ if skip_near_origin else -1.0)
+            return idx
         return _farthest_steps(xyz, m, first, skip_near_origin)
     arrays, starts, out = xyz.numpy(), first.tolist(), np.empty((clouds, m), np.int64)
 
@@ -147,10 +148,11 @@ def _greedy(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
         return _greedy_steps(xyz, m, start)
     if n >= 16 and m * n > BUCKETS_PAY:
         height = max(3, round(np.log2(n) / 2 - 1))
-        chosen = fpsample.bucket_fps_kdline_sampling(xyz, m, height, _tree_slot(xyz, height, start))
+        chosen: np.ndarray = fpsample.bucket_fps_kdline_sampling(xyz, m, height, _tree_slot(xyz, height, start))
         if chosen[0] == start:
             return chosen.astype(np.int64)
-    return fpsample.fps_sampling(xyz, m, start).astype(np.int64)
+    chosen = fpsample.fps_sampling(xyz, m, start)
+    return chosen.astype(np.int64)
 
 
 def _greedy_steps(xyz: np.ndarray, m: int, start: int) -> np.ndarray:

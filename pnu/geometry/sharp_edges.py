@@ -27,7 +27,8 @@ def sharp_edges(mesh: Mesh, angle: float = 40.0) -> np.ndarray:
     pairs = face[np.argsort(which.reshape(-1), kind="stable")]
     first = (np.cumsum(count) - count)[count == 2]
     cosine = np.einsum("ij,ij->i", normals[pairs[first]], normals[pairs[first + 1]])
-    return vertices[unique[count == 2][cosine < np.cos(np.radians(angle))]]
+    sharp: np.ndarray = vertices[unique[count == 2][cosine < np.cos(np.radians(angle))]]
+    return sharp
 
 
 def sharp_edge_points(mesh: Mesh, spacing: float, angle: float = 40.0) -> np.ndarray:
@@ -39,4 +40,5 @@ def sharp_edge_points(mesh: Mesh, spacing: float, angle: float = 40.0) -> np.nda
     edge = np.repeat(np.arange(len(edges)), steps)
     place = np.arange(steps.sum()) - np.repeat(np.cumsum(steps) - steps, steps)
     share = (place / (steps[edge] - 1))[:, None]
-    return (1 - share) * edges[edge, 0] + share * edges[edge, 1]
+    points: np.ndarray = (1 - share) * edges[edge, 0] + share * edges[edge, 1]
+    return points

@@ -1,11 +1,10 @@
 """How dense a cloud is."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 
-def spacing(points: NDArray, neighbors: int = 6) -> float:
+def spacing(points: np.ndarray, neighbors: int = 6) -> float:
     """Spacing that as many points have if evenly spread over the same surface, from the area that neighbors fill.
 
     points `(n, >= 3)`; n > `neighbors` for a good answer. The median over at most 4000 of the points. Random and even

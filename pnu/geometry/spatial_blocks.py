@@ -28,7 +28,9 @@ class Blocks(NamedTuple):
 
     def inside(self, points: Points, number: int, margin: float) -> NDArray[np.bool_]:
         """Which points (n, 3) lie in the box of a block, grown by `margin` on all sides."""
-        return ((points >= self.low[number] - margin) & (points <= self.high[number] + margin)).all(1)
+        within = (points >= self.low[number] - margin) & (points <= self.high[number] + margin)
+        every: NDArray[np.bool_] = within.all(1)
+        return every
 
     def halo(self, points: Points, number: int, margin: float) -> Index:
         """Points of the cloud that are no members of a block but in its box, grown by `margin`."""

@@ -33,7 +33,7 @@ def small_rotation(
 
 def rotate(cloud: Tensor, rotation: Tensor) -> Tensor:
     """R p for the points and, in a cloud (B, n, 6), R n for the normals; rotation (B, 3, 3) or (3, 3)."""
-    parts = cloud.split(3, dim=-1)
+    parts = torch.split(cloud, 3, dim=-1)
     return torch.cat([part @ rotation.transpose(-1, -2) for part in parts], -1)
 
 

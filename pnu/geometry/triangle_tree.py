@@ -71,7 +71,8 @@ def closest_on_triangle(query: Array, triangle: Array) -> Array:
 
 
 def _dot(a: Array, b: Array) -> Array:
-    return np.einsum("...i,...i", a, b)
+    product: Array = np.einsum("...i,...i", a, b)
+    return product
 
 
 def _best(queries: Array, triangles: Array, query: Index, candidate: Index) -> Closest:

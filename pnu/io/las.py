@@ -33,7 +33,8 @@ def _laspy(path: Path) -> ModuleType:
         import laspy
     except ImportError:
         raise ValueError(f"{path}: las and laz need laspy, which is not installed: pip install 'pnu[las]'") from None
-    return laspy
+    module: ModuleType = laspy
+    return module
 
 
 def read_las(path: Path) -> Content:
@@ -103,7 +104,7 @@ def _geographic(header: Any) -> bool:
     for record in header.vlrs:
         for key in getattr(record, "geo_keys", None) or []:
             if key.id == MODEL_TYPE and key.tiff_tag_location == 0:
-                return key.value_offset == 2
+                return bool(key.value_offset == 2)
         text = str(getattr(record, "string", "") or "").lstrip("\0 \n").upper()
         if text.startswith(("GEOGCS", "GEOGCRS", "GEODCRS", "GEOGRAPHICCRS")):
             return True

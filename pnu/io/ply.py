@@ -5,7 +5,7 @@ import struct
 from collections.abc import Mapping
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -262,7 +262,7 @@ def _row_lengths(data: mmap.mmap, start: int, element: Element, order: str) -> t
 
 
 def _row_dtype(element: Element, order: str, lengths: Mapping[str, int]) -> np.dtype:
-    fields: list[tuple] = []
+    fields: list[tuple[Any, ...]] = []
     for item in element.properties:
         if item.length:
             fields.append((f"{item.name} count", order + item.length))

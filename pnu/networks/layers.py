@@ -25,8 +25,8 @@ class Layer(nn.Module):
             nn.init.kaiming_normal_(self.linear.weight)
 
     def forward(self, x: Tensor) -> Tensor:
-        rows = self.linear(x).flatten(0, -2)
-        return self.norm(rows).relu().view(*x.shape[:-1], -1)
+        rows: Tensor = self.norm(self.linear(x).flatten(0, -2))
+        return rows.relu().view(*x.shape[:-1], -1)
 
 
 class MLP(nn.Sequential):
@@ -34,6 +34,11 @@ class MLP(nn.Sequential):
 
     def __init__(self, widths: Sequence[int], *, bias: bool = True) -> None:
         super().__init__(*(Layer(*pair, bias=bias) for pair in itertools.pairwise(widths)))
+
+    def forward(self, x: Tensor) -> Tensor:
+        for layer in self:
+            x = layer(x)
+        return x
 
 
 class PooledMLP(MLP):
@@ -70,8 +75,8 @@ class Abstraction(nn.Module):
         """Features (B, n, C) at points (B, n, 3), pooled around centers (B, m, 3): (B, m, C')."""
         neighbors = ball_query(centers, points, self.radius, self.k)
         offsets = gather(points, neighbors) - centers[:, :, None]
-        rows = torch.cat([offsets, gather(features, neighbors)], -1)  # (B, m, k, 3 + C)
-        return self.mlp(rows).amax(2)
+        rows: Tensor = self.mlp(torch.cat([offsets, gather(features, neighbors)], -1))  # (B, m, k, 3 + C) -> C'
+        return rows.amax(2)
 
 
 class Propagation(nn.Module):
@@ -84,7 +89,8 @@ class Propagation(nn.Module):
     def forward(self, fine_points: Tensor, coarse_points: Tensor, skip: Tensor, features: Tensor) -> Tensor:
         """Features (B, m, C) at coarse points (B, m, 3), carried to fine points (B, n, 3): (B, n, C')."""
         carried = interpolate(features, coarse_points, fine_points)
-        return self.mlp(torch.cat([carried, skip], -1))
+        joined: Tensor = self.mlp(torch.cat([carried, skip], -1))
+        return joined
 
 
 def expand(features: Tensor) -> Tensor:

@@ -50,7 +50,8 @@ def check_rows(count: float) -> None:
 def everywhere(sums: Tensor) -> Tensor:
     """Sums over all processes, with gradient where one is wanted."""
     if torch.is_grad_enabled() and sums.requires_grad:
-        return all_reduce(sums)
+        with_gradient: Tensor = all_reduce(sums)
+        return with_gradient
     total = sums.clone()
     torch.distributed.all_reduce(total)
     return total

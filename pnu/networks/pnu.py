@@ -114,7 +114,7 @@ class PNU(nn.Module):
         points = self.regression(features)
         # the released order: all first halves, then all second ones, the last expansion outermost
         steps = len(self.expansions)
-        predicted = (
+        predicted: Tensor = (
             points.unflatten(1, (n, *[2] * steps))
             .permute(0, *range(steps + 1, 0, -1), -1)
             .reshape(len(patch), -1, points.shape[-1])

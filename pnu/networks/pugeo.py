@@ -30,7 +30,8 @@ class EdgeConvolution(nn.Module):
 
     def pooled(self, edges: Tensor) -> Tensor:
         """Edges (B, n, k, C'), of which the maximum is left."""
-        return self.norm(edges.flatten(0, -2)).view(edges.shape).relu().amax(2)
+        rows: Tensor = self.norm(edges.flatten(0, -2))
+        return rows.view(edges.shape).relu().amax(2)
 
 
 class PUGeo(nn.Module):

@@ -78,7 +78,8 @@ class PUNet(nn.Module):
 
     def forward(self, patch: Tensor) -> Tensor:
         points = coordinates(patch)
-        return self.regression(self.expansion(self.features(points)))
+        dense: Tensor = self.regression(self.expansion(self.features(points)))
+        return dense
 
     def outputs(self, patch: Tensor) -> dict[str, Tensor]:
         return {"prediction": self(patch)}

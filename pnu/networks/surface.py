@@ -45,7 +45,7 @@ class Projector(nn.Module):
         context = self.context(torch.cat([y.amax(1), self.weighed(y.clone(), y), frame.height], -1))
         # the bias is added to the few contexts, not to the many neighbors
         y = linear(y, self.third.weight).add_((context + self.third.bias)[:, None]).relu_()
-        of_features, of_choices = self.attention.weight.split([y.shape[-1], 2])
+        of_features, of_choices = torch.split(self.attention.weight, [y.shape[-1], 2])
         seen = self.weighed(linear(y, of_features), y)
         choice = self.shares(linear(y, of_choices))
         out = self.out(self.head(torch.cat([y.amax(1), seen, context], -1)))

@@ -59,7 +59,7 @@ class Surface(NamedTuple):
 
 
 def reconstruct(
-    points: NDArray, normals: NDArray, *, depth: int | None = None, timeout: float = 600, name: str = "cloud"
+    points: np.ndarray, normals: np.ndarray, *, depth: int | None = None, timeout: float = 600, name: str = "cloud"
 ) -> Surface:
     """The surface through points `(n, 3)` along normals `(n, 3)`; those of no length are estimated. In their frame.
 
@@ -97,13 +97,13 @@ def reconstruct(
     return Surface(mesh, found["density"], depth, inside_out, *shares)
 
 
-def octree_depth(points: NDArray) -> int:
+def octree_depth(points: np.ndarray) -> int:
     """Depth at which an octree cell is at most half the points' spacing, within 4..11."""
     cells = BOX * np.ptp(points, axis=0).max() / spacing(points)
     return int(np.clip(np.ceil(np.log2(cells)) + 1, SHALLOWEST, DEEPEST))
 
 
-def run_child(points: Array, normals: Array, depth: int, timeout: float) -> dict[str, NDArray]:
+def run_child(points: Array, normals: Array, depth: int, timeout: float) -> dict[str, np.ndarray]:
     """The surface that a process of its own makes; `ValueError` where it crashes or takes too long."""
     with tempfile.TemporaryDirectory(prefix="pnu-") as folder:
         source, target = Path(folder, "cloud.npz"), Path(folder, "mesh.npz")
@@ -154,8 +154,9 @@ def trim(surface: Surface, quantile: float) -> Surface:
     return surface._replace(mesh=Mesh(surface.mesh.vertices[used], number[faces]), density=surface.density[used])
 
 
-def interpolate(points: NDArray, values: NDArray, query: NDArray, k: int = 4) -> Array:
+def interpolate(points: np.ndarray, values: np.ndarray, query: np.ndarray, k: int = 4) -> Array:
     """Values `(n, c)` of points `(n, 3)`, such as colors, at `query` `(m, 3)`: k nearest, by inverse distance."""
     far, near = cKDTree(points).query(query, k=np.arange(1, min(k, len(points)) + 1))
     weight = 1 / (far + 1e-9 * (far.max() or 1.0))
-    return (weight[..., None] * np.asarray(values, np.float64)[near]).sum(1) / weight.sum(1, keepdims=True)
+    mean: Array = (weight[..., None] * np.asarray(values, np.float64)[near]).sum(1) / weight.sum(1, keepdims=True)
+    return mean

@@ -58,7 +58,7 @@ def surface_errors(mesh: Mesh, truth: Mesh, *, rng: np.random.Generator, samples
     return SurfaceErrors(distance, np.degrees(np.arccos(cosine.clip(-1, 1))), from_truth, box_radius(truth))
 
 
-def check_frame(points: NDArray, truth: Mesh, *, name: str = "cloud", truth_name: str = "truth") -> None:
+def check_frame(points: np.ndarray, truth: Mesh, *, name: str = "cloud", truth_name: str = "truth") -> None:
     """ValueError if the points `(n, 3)` cannot lie on the true surface, because they are in another frame or unit.
 
     Half of them (of at most 1000) must lie within 5 % of the true radius.

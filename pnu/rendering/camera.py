@@ -15,18 +15,18 @@ class Camera(NamedTuple):
     center: Array  # (3,) the point in the middle of the picture
     half_size: float  # half the picture's side, in units of the points
 
-    def view(self, points: NDArray) -> Array:
+    def view(self, points: np.ndarray) -> Array:
         """View coordinates `(n, 3)` of points `(n, 3)`."""
         return (points - self.center) @ self.rotation.T / self.half_size
 
 
-def in_one_place(first: NDArray, *others: NDArray) -> bool:
+def in_one_place(first: np.ndarray, *others: np.ndarray) -> bool:
     """Whether clouds `(n, >= 3)` are about as large as the first and where it is, so that one camera shows them all.
 
     Their boxes, without the farthest 2 % on each side, differ by less than a factor of 2 and half a diagonal.
     """
 
-    def box(points: NDArray) -> tuple[Array, float]:
+    def box(points: np.ndarray) -> tuple[Array, float]:
         low, high = np.percentile(points[:, :3], [2, 98], axis=0)
         return (low + high) / 2, float(np.linalg.norm(high - low))
 
@@ -38,7 +38,7 @@ def in_one_place(first: NDArray, *others: NDArray) -> bool:
 
 
 def look_at(
-    *points: NDArray, azimuth: float = 30, elevation: float = 15, up: str = "y", margin: float = 1.04
+    *points: np.ndarray, azimuth: float = 30, elevation: float = 15, up: str = "y", margin: float = 1.04
 ) -> Camera:
     """The camera that sees all `points` (arrays `(n, >= 3)`).
 

@@ -22,13 +22,13 @@ RGB = np.array(
 )
 
 
-def srgb(linear: NDArray) -> NDArray:
+def srgb(linear: np.ndarray) -> np.ndarray:
     """Linear light in 0..1 to sRGB's transfer curve, any shape; values outside are clipped."""
     linear = np.clip(linear, 0, 1)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def linear_light(encoded: NDArray) -> NDArray:
+def linear_light(encoded: np.ndarray) -> np.ndarray:
     """The inverse of `srgb`."""
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
@@ -49,7 +49,7 @@ def _error(t: Array) -> Array:
 COLORMAPS = {"error": _error, "perceptual": _perceptual}
 
 
-def value_colors(values: NDArray, limits: tuple[float, float], colormap: str = "error") -> Colors:
+def value_colors(values: np.ndarray, limits: tuple[float, float], colormap: str = "error") -> Colors:
     """Colors `(..., 3)` of numbers `(...)`; what lies outside `limits` gets the color of the nearer end.
 
     `colormap` is "error" (red = low, over green, blue = high, as the paper) or "perceptual" (dark = low, light = high,
@@ -62,15 +62,16 @@ def value_colors(values: NDArray, limits: tuple[float, float], colormap: str = "
         raise ValueError(f"color limits {low}, {high}: expected two finite numbers, the second larger")
     known = np.isfinite(values)
     t = np.clip((np.where(known, values, low) - low) / (high - low), 0, 1)
-    rgb = np.where(known[..., None], COLORMAPS[colormap](t), 0.6)
-    return np.rint(255 * rgb).astype(np.uint8)
+    rgb: np.ndarray = np.rint(255 * np.where(known[..., None], COLORMAPS[colormap](t), 0.6))
+    return rgb.astype(np.uint8)
 
 
-def typical_limit(errors: NDArray) -> float:
+def typical_limit(errors: np.ndarray) -> float:
     """The end of a color scale that starts at 0: what 98 % of the errors stay below."""
     return float(np.quantile(errors, 0.98)) or float(errors.max()) or 1e-12
 
 
-def normal_colors(normals: NDArray) -> Colors:
+def normal_colors(normals: np.ndarray) -> Colors:
     """Colors `(n, 3)` of unit normals `(n, 3)`: x, y, z from -1..1 to red, green, blue from 0..255."""
-    return np.rint(127.5 * (np.clip(normals, -1, 1) + 1)).astype(np.uint8)
+    rgb: np.ndarray = np.rint(127.5 * (np.clip(normals, -1, 1) + 1))
+    return rgb.astype(np.uint8)

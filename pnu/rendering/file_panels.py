@@ -29,7 +29,7 @@ class Shape(NamedTuple):
     points: NDArray[np.float64]  # (n, 3), of a mesh its vertices
     normals: NDArray[np.float64] | None  # (n, 3)
     mesh: Mesh | None
-    attributes: dict[str, NDArray]
+    attributes: dict[str, np.ndarray]
     notes: tuple[str, ...] = ()  # what was found and done while the file was read
 
     def source(self, color: str) -> str:

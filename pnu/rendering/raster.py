@@ -96,9 +96,10 @@ def barycentric(corners: Array, point: Array) -> Array:
     flat = np.abs(area) < 1e-12
     second = (p[:, 0] * b[:, 1] - p[:, 1] * b[:, 0]) / np.where(flat, 1, area)
     third = (a[:, 0] * p[:, 1] - a[:, 1] * p[:, 0]) / np.where(flat, 1, area)
-    weight = np.clip(np.stack([1 - second - third, second, third], 1), 0, 1)
+    weight: Array = np.clip(np.stack([1 - second - third, second, third], 1), 0, 1)
     weight[flat] = 1
-    return weight / weight.sum(1, keepdims=True)
+    weight /= weight.sum(1, keepdims=True)
+    return weight
 
 
 def balls(center: Array, radius: float, height: int, width: int) -> Fragments:

@@ -20,7 +20,7 @@ STONE = (130, 142, 160)  # points without colors and normals
 
 
 def render_cloud(
-    cloud: NDArray,
+    cloud: np.ndarray,
     colors: NDArray[np.uint8] | None = None,
     *,
     camera: Camera,
@@ -144,4 +144,5 @@ def in_front(center: Array, radius: float, pixels: int) -> NDArray[np.bool_]:
     reach = np.arange(-int(radius), int(radius) + 1)
     surface = minimum_filter(surface, footprint=reach[:, None] ** 2 + reach**2 <= radius**2, mode="nearest")
     column, row = np.clip(center[:, :2].astype(np.int64), 0, pixels - 1).T
-    return center[:, 2] > surface[row, column] - radius / 2
+    seen: NDArray[np.bool_] = center[:, 2] > surface[row, column] - radius / 2
+    return seen

@@ -83,4 +83,5 @@ def resolve(linear: Image, covered: NDArray[np.bool_], supersample: int) -> NDAr
     linear = np.where(covered[..., None], linear, 1).clip(0, 1)
     h, w = covered.shape[0] // supersample, covered.shape[1] // supersample
     mean = linear.reshape(h, supersample, w, supersample, 3).mean((1, 3))
-    return np.rint(255 * srgb(mean)).astype(np.uint8)
+    rgb: np.ndarray = np.rint(255 * srgb(mean))
+    return rgb.astype(np.uint8)

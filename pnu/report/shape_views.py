@@ -57,7 +57,7 @@ def rebuild(shown: Shown, seed: int = 0) -> tuple[dict[str, Rebuilt], list[str]]
     if truth.mesh is None:
         return {}, [f"{truth.shape}: has no true mesh to measure surfaces against"]
 
-    def surface_of(cloud: NDArray) -> reconstruction.Surface | str:
+    def surface_of(cloud: np.ndarray) -> reconstruction.Surface | str:
         try:
             return reconstruction.reconstruct(cloud[:, :3], cloud[:, 3:])
         except ValueError as error:
@@ -78,7 +78,7 @@ def rebuild(shown: Shown, seed: int = 0) -> tuple[dict[str, Rebuilt], list[str]]
     return made, notes
 
 
-def error_limit(errors: Sequence[NDArray]) -> float:
+def error_limit(errors: Sequence[np.ndarray]) -> float:
     """One end of the colors for all: what 98 % of the errors of the median method stay below."""
     return float(np.median([typical_limit(error) for error in errors])) if errors else 1e-2
 
@@ -104,7 +104,7 @@ def view(shown: Shown, rebuilt: Mapping[str, Rebuilt], points: int) -> offline_p
     return offline_page.View(truth.shape, shown.case.kind, drawings, np.zeros(3), 1.0, error_limit(errors))
 
 
-def thinned(cloud: NDArray, points: int) -> NDArray:
+def thinned(cloud: np.ndarray, points: int) -> np.ndarray:
     """At most so many points of a cloud, evenly taken."""
     return cloud[:: -(-len(cloud) // points)]
 

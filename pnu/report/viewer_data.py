@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pnu.geometry.mesh_topology import split_creases
 from pnu.geometry.spacing import spacing
@@ -19,10 +18,10 @@ class Drawing(NamedTuple):
     """One thing to show in a view: a cloud, a surface, or both."""
 
     name: str
-    cloud: NDArray | None = None  # (n, 3) or (n, 6)
-    cloud_error: NDArray | None = None  # (n,)
+    cloud: np.ndarray | None = None  # (n, 3) or (n, 6)
+    cloud_error: np.ndarray | None = None  # (n,)
     surface: Mesh | None = None
-    surface_error: NDArray | None = None  # (v,)
+    surface_error: np.ndarray | None = None  # (v,)
 
 
 class View(NamedTuple):
@@ -31,7 +30,7 @@ class View(NamedTuple):
     shape: str
     kind: str
     drawings: Sequence[Drawing]
-    center: NDArray  # (3,) of the true shape
+    center: np.ndarray  # (3,) of the true shape
     radius: float
     limit: float  # error at the end of the colors, in the unit of the points
 
@@ -43,7 +42,7 @@ class Packer:
         self.parts: list[bytes] = []
         self.size = 0
 
-    def add(self, values: NDArray, dtype: str) -> list[int]:
+    def add(self, values: np.ndarray, dtype: str) -> list[int]:
         """Where the values lie: [first byte, number of values]."""
         place = [self.size, values.size]
         data = np.ascontiguousarray(values, np.dtype(dtype)).tobytes()
@@ -82,7 +81,7 @@ def encode(view: View) -> dict[str, Any]:
 
 
 def vertices(
-    packer: Packer, view: View, points: NDArray, normals: NDArray | None, error: NDArray | None
+    packer: Packer, view: View, points: np.ndarray, normals: np.ndarray | None, error: np.ndarray | None
 ) -> dict[str, Any]:
     """Points with their normals and errors, packed."""
     unit = (points - view.center) / (RANGE * view.radius)

@@ -34,11 +34,14 @@ def git_revision() -> str | None:
     here = Path(__file__).resolve().parents[2]
     if not (here / ".git").exists():
         return None
+
+    def git(*arguments: str) -> str:
+        run = subprocess.run(["git", *arguments], cwd=here, capture_output=True, text=True, timeout=10, check=True)
+        return str(run.stdout)
+
     try:
-        options = {"cwd": here, "capture_output": True, "text": True, "timeout": 10, "check": True}
-        revision = subprocess.run(["git", "rev-parse", "HEAD"], **options).stdout.strip()  # type: ignore[call-overload]
-        status = ["git", "status", "--porcelain", "-uall"]
-        lines = subprocess.run(status, **options).stdout.splitlines()  # type: ignore[call-overload]
+        revision = git("rev-parse", "HEAD").strip()
+        lines = git("status", "--porcelain", "-uall").splitlines()
     except (OSError, subprocess.SubprocessError):
         return None
     changes = [line for line in lines if not line.startswith("??") or re.match(r'\?\? "?(pnu|conf)/', line)]

@@ -22,7 +22,6 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 Work = Callable[[Tensor], Tensor]
@@ -117,7 +116,7 @@ class _Worker:
         self.network: nn.Module | None = None
         self.begun = (b"", "")
 
-    def __call__(self, begin: bytes, cloud: str, part: NDArray) -> NDArray:
+    def __call__(self, begin: bytes, cloud: str, part: np.ndarray) -> np.ndarray:
         try:
             if self.network is None:
                 self.network = pickle.loads(self.pickled).to(self.device)
@@ -151,5 +150,5 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _work(begin: bytes, cloud: str, part: NDArray) -> NDArray:
+def _work(begin: bytes, cloud: str, part: np.ndarray) -> np.ndarray:
     return _worker(begin, cloud, part)

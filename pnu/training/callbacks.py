@@ -397,7 +397,8 @@ def unit(cloud: np.ndarray) -> np.ndarray:
     """Unit normals (n, 3) of a cloud (n, 6); zeros, shown gray, for a cloud without normals."""
     if cloud.shape[1] < 6:
         return np.zeros((len(cloud), 3))
-    return cloud[:, 3:6] / np.maximum(np.linalg.norm(cloud[:, 3:6], axis=1, keepdims=True), 1e-12)
+    normals: np.ndarray = cloud[:, 3:6] / np.maximum(np.linalg.norm(cloud[:, 3:6], axis=1, keepdims=True), 1e-12)
+    return normals
 
 
 KEEPERS = (Checkpoints, Pictures)

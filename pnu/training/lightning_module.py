@@ -13,8 +13,8 @@ from typing import Any
 
 import lightning.pytorch as pl
 import torch
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.plugins.layer_sync import TorchSyncBatchNorm
-from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 
@@ -158,7 +158,8 @@ class UpsamplingModule(pl.LightningModule):
             self.check_finite(found)
             raise
         self.micro_batches.append((found | {name: value.detach() for name, value in terms.items()}, batch))
-        return terms["loss"]
+        loss: Tensor = terms["loss"]
+        return loss
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """Checks and logs the step: means over micro-batches and processes, in one transfer from the device."""

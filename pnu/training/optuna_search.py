@@ -1,5 +1,6 @@
 """A search by Optuna that goes on from its storage."""
 
+import logging
 import warnings
 from typing import Any
 
@@ -21,7 +22,7 @@ def arguments(hydra: Any) -> list[str]:
     import optuna
     from optuna.trial import TrialState
 
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    optuna.logging.set_verbosity(logging.WARNING)
     if sweeper.study_name not in {summary.study_name for summary in optuna.get_all_study_summaries(storage)}:
         return []
     study = optuna.load_study(study_name=sweeper.study_name, storage=storage)

@@ -31,7 +31,7 @@ class Midpoint:
             near = knn(cloud[None, :, :3], cloud[None, :, :3], min(self.neighbors + 1, len(cloud))).idx[0]
             here = torch.arange(len(cloud))[:, None].expand_as(near)
             pairs = torch.stack([torch.minimum(here, near), torch.maximum(here, near)], -1).flatten(0, 1)
-            pairs = pairs[pairs[:, 0] != pairs[:, 1]].unique(dim=0)
+            pairs = torch.unique(pairs[pairs[:, 0] != pairs[:, 1]], dim=0)
             middle = cloud[pairs].mean(1)
             opposite = middle[:, 3:].norm(dim=1, keepdim=True) < 1e-6
             normals = torch.where(opposite, cloud[pairs[:, 0], 3:], normalize(middle[:, 3:], dim=1))

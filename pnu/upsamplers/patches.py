@@ -90,7 +90,8 @@ class Patches:
 
         def predict(first: int) -> Tensor:
             found = []
-            for number, part in enumerate(workers.map(begin, cloud, idx[first : first + KEPT].split(together)), 1):
+            parts = torch.split(idx[first : first + KEPT], together)
+            for number, part in enumerate(workers.map(begin, cloud, parts), 1):
                 found.append(part)
                 context.progress(stage, min(first + number * together, len(idx)), len(idx))
             return torch.cat(found)
@@ -123,7 +124,7 @@ def predictions(network: nn.Module, cloud: Tensor, batch_size: int | None = None
         return dense.flatten(0, 1)
 
     def work(idx: Tensor) -> Tensor:
-        batches = idx.split(size)
+        batches = torch.split(idx, size)
         return torch.cat(threads.map_on_threads(predict, batches) if on_cpu else [predict(batch) for batch in batches])
 
     return work

@@ -57,6 +57,6 @@ def _least_moved(seeds: Tensor, projected: Tensor, cloud: Tensor, count: int) ->
     points = cloud[None, :, :3]
     spacing = knn(points, points, min(9, len(cloud))).dist_sq[0, :, -1].sqrt()
     local = spacing[nearest(projected[None, :, :3], points).idx[0]]
-    moved = (projected[:, :3] - seeds).norm(dim=1) / local.clamp(min=torch.finfo(local.dtype).tiny)
+    moved: Tensor = (projected[:, :3] - seeds).norm(dim=1) / local.clamp(min=torch.finfo(local.dtype).tiny)
     kept = max(count, int((moved < 1).sum()))
     return moved.argsort()[:kept]

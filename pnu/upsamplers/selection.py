@@ -30,7 +30,8 @@ def upsampler_of(model: Any, patch_size: int | None = None) -> Upsampler:
     for it: "surface" for networks that project points; without it "patches", of `patch_size` points if not None.
     """
     if hasattr(model, "upsample_cloud"):
-        return model
+        itself: Upsampler = model
+        return itself
     return SurfaceProjection(model) if is_projection(model) else Patches(model, patch_size)
 
 
@@ -42,7 +43,8 @@ def is_projection(network: Any) -> bool:
 def dense_patches(network: Any, patches: Tensor) -> Tensor:
     """What comes out for patches in the network's frame: (B, n, 6) -> (B, ratio n, 6), or (B, ratio n, 3)."""
     if not is_projection(network):
-        return network(patches)
+        dense: Tensor = network(patches)
+        return dense
     upsampler, count = SurfaceProjection(network), network.ratio * patches.shape[1]
     context = Context(device=patches.device)
     with torch.no_grad():

@@ -83,7 +83,7 @@ def in_parts(
     query = query[order]
 
     def project(first: int) -> Tensor:
-        parts = query[first : first + KEPT].split(size)
+        parts = torch.split(query[first : first + KEPT], size)
         found = []
         for number, part in enumerate(workers.map(begin, cloud, parts), 1):
             found.append(part.to(cloud))
