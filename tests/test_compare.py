@@ -118,6 +118,19 @@ def test_same_seed_same_numbers(made: Path, place: Path) -> None:
     assert (place / "again" / "figures" / "egg_sparse.png").is_file()  # clouds only
 
 
+def test_columns_of_pairs_as_text(place: Path, tmp_path: Path) -> None:
+    ball = icosphere(3)
+    cloud = sample_poisson_disk(ball, 300, np.random.default_rng(0))
+    for folder in ("clouds", "truth"):
+        (tmp_path / folder).mkdir()
+    write_mesh(tmp_path / "truth" / "ball.ply", ball)
+    np.savetxt(tmp_path / "clouds" / "ball.csv", cloud[:, [3, 4, 5, 2, 1, 0]], delimiter=",")
+    data = ["data=meshes", f"data.root={tmp_path}", "columns=nx,ny,nz,z,y,x"]
+    main(["methods=[midpoint]", *data, *SMALL, "surfaces=[]", f"output={tmp_path}/out"])
+    rows = read_json(tmp_path / "out" / "metrics.json")["rows"]
+    assert [row["p2f"] < 0.01 for row in rows if row["method"] == "midpoint"] == [True]
+
+
 def test_a_network_of_a_run_folder(place: Path) -> None:
     data = ["data=meshes", f"data.root={place}/meshes", "kinds=[uniform]", "surfaces=[]", "shapes=[ball]"]
     main([f"methods=[{place}/runs/first,ours:{place}/runs/first]", *data, *SMALL, f"output={place}/network"])

@@ -245,6 +245,7 @@ def test_source_of_a_folder_of_meshes(tmp_path: Path, box: Mesh) -> None:
         ({"path": "patches.h5"}, {}, "data: evaluation takes whole shapes: data=synthetic, or data=meshes"),
         ({"root": None}, {}, "data: evaluation takes whole shapes"),
         ({"root": "nowhere"}, {}, "data.root=nowhere: no such folder"),
+        ({"kinds": ["cad"]}, {"columns": "x,y,z"}, "columns=x,y,z: is for prepared pairs, data=meshes"),
     ],
 )
 def test_sources_refuse_at_once(data: dict, options: dict, text: str) -> None:
@@ -288,6 +289,28 @@ def test_pairs_with_samples_only_have_no_floor_and_no_p2f(pairs: Path, box: Mesh
     assert [row["method"] for row in rows] == ["input"]
     assert "p2f" not in rows[0]
     assert rows[0]["normal_unsigned_deg"] < 30
+
+
+def test_columns_of_pairs_as_text(pairs: Path, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points, normals, _, _ = read_cloud(pairs / "clouds" / "sink.xyz")
+    assert normals is not None
+    (pairs / "clouds" / "sink.xyz").unlink()
+    np.savetxt(pairs / "clouds" / "sink.txt", np.hstack([normals, np.ones((len(points), 1)), points]))
+    columns = "nx,ny,nz,_,x,y,z"
+    found = benchmark.source({"root": str(pairs)}, truth_points=500, columns=columns, warn=silent)
+    (case,) = found.cases
+    assert case.normals is not None
+    np.testing.assert_allclose(case.normals, normals, atol=1e-9)
+    np.testing.assert_allclose(closest_points(case.truth.mesh, case.points)[1], 0, atol=1e-6)
+    main(["method=midpoint", "data=meshes", f"data.root={pairs}", "truth_points=500", f"columns={columns}"])
+    assert capsys.readouterr().out.endswith(f"""data.root={pairs} 'columns="{columns}"'\n""")
+    for wrong, text in {"x,y": "columns=x,y: expected x, y and z", "3": "columns=3: expected x, y and z"}.items():
+        with pytest.raises(ValueError, match=text):
+            benchmark.source({"root": str(pairs)}, columns=wrong)
+    (pairs / "clouds" / "sink.txt").unlink()
+    write_cloud(pairs / "clouds" / "sink.ply", points)
+    with pytest.raises(ValueError, match=r"columns=x,y,z: is for text and arrays without .*/clouds has none"):
+        benchmark.source({"root": str(pairs)}, columns="x,y,z")
 
 
 def save_samples(pairs: Path, box: Mesh, *counts: int) -> None:

@@ -10,7 +10,7 @@ from PIL import Image
 from pnu.commands.picture import main as picture
 from pnu.geometry.mesh_topology import corner_normals, split_creases
 from pnu.geometry.spacing import spacing
-from pnu.io import Mesh
+from pnu.io import Mesh, write_cloud
 from pnu.rendering import Camera, ColorBar, figure, in_one_place, look_at, raster, render_cloud, render_mesh, save_png
 from pnu.rendering.colors import LMS, RGB, linear_light, normal_colors, srgb, value_colors
 from pnu.rendering.figure import colorbar_figure, draw_colorbar, extent
@@ -241,27 +241,34 @@ def test_different_objects_are_each_seen_whole(tmp_path: Path, capsys: pytest.Ca
     assert not in_one_place(small, small + 3)
 
 
-def test_columns_of_text_or_panels_in_a_row(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_columns_of_text_and_panels_in_a_row(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cloud = sphere(300)
     np.savetxt(tmp_path / "c.txt", np.hstack([cloud[:, 3:], cloud[:, :3]]))
+    write_cloud(tmp_path / "d.ply", cloud[:, :3])
 
-    def draw(columns: str) -> str:
-        given = f"inputs=[{tmp_path}/c.txt,{tmp_path}/c.txt]"
-        picture([given, f"output={tmp_path}/a.png", "size=60", f"columns={columns}"])
+    def draw(*more: str, inputs: str = "c.txt,d.ply") -> str:
+        files = ",".join(f"{tmp_path}/{name}" for name in inputs.split(","))
+        picture([f"inputs=[{files}]", f"output={tmp_path}/a.png", "size=60", *more])
         return capsys.readouterr().out
 
-    assert "(cloud, color=normal)" in draw("nx,ny,nz,x,y,z")
-    assert "(cloud, color=plain)" in draw("_,_,_,x,y,z")
-    draw("1")
+    assert "(cloud, color=normal)" in draw("columns=nx,ny,nz,x,y,z")
+    assert "c.txt (cloud, color=plain)" in draw("columns=_,_,_,x,y,z", "panels=1")
     one = np.asarray(Image.open(tmp_path / "a.png")).shape
-    draw("2")
+    draw("columns=_,_,_,x,y,z", "panels=2")
     two = np.asarray(Image.open(tmp_path / "a.png")).shape
     assert one[0] > two[0]
     assert one[1] < two[1]
-    for wrong, message in {"0": "a number above 0, or names", "x,y": "expected x, y and z among the names"}.items():
+    for wrong, message in {
+        "columns=2": "columns=2: expected names such as x,y,z,_,r,g,b; panels=2 puts as many in a row",
+        "columns=x,y": "columns=x,y: expected x, y and z among the names",
+        "panels=0": "panels=0: expected a number above 0",
+    }.items():
         with pytest.raises(SystemExit):
             draw(wrong)
         assert message in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        draw("columns=x,y,z", inputs="d.ply,d.ply")
+    assert "columns=x,y,z: is for text and arrays without names, and inputs has none of them" in capsys.readouterr().err
 
 
 def test_crop_keeps_all_ink() -> None:

@@ -131,7 +131,7 @@ def test_picture_of_files(folder: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert width > 2.5 * height
     plain = image[:, int(0.62 * width) : int(0.8 * width)]
     assert np.ptp(plain, axis=2).max() < 20  # the true surface is gray
-    run(picture, inputs=f"[{files}]", output=tmp_path / "b.png", size=100, color="plain", columns=1, captions="[a,b,c]")
+    run(picture, inputs=f"[{files}]", output=tmp_path / "b.png", size=100, color="plain", panels=1, captions="[a,b,c]")
     tall = np.asarray(Image.open(tmp_path / "b.png"))
     assert tall.shape[0] > 2.5 * tall.shape[1]
     assert np.ptp(tall.astype(int), axis=2).max() < 40
@@ -172,6 +172,8 @@ def test_columns_of_text(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     np.savetxt(tmp_path / "c.txt", np.hstack([normals, np.ones((300, 1)), points]))
     given = {"input": tmp_path / "c.txt", "output": tmp_path / "m.ply", "depth": 4}
     run(reconstruct, **given, columns="nx,ny,nz,_,x,y,z")
-    assert "c.txt, 300 points, with normals\noutput:" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "c.txt, 300 points, with normals\noutput:" in said
+    assert said.endswith("""output=picture.png 'columns="nx,ny,nz,_,x,y,z"'\n""")  # the picture reads that file too
     line = refused(capsys, reconstruct, **given | {"output": tmp_path / "n.ply"}, columns="nx,ny,nz,x,y,z")
     assert "columns=nx,ny,nz,x,y,z are 6 names, line 1 has 7 columns" in line

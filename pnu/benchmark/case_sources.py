@@ -9,6 +9,7 @@ from pnu.benchmark.cases import KINDS, Case, Warn, is_pairs_folder, mesh_cases, 
 from pnu.data import shapes
 from pnu.data.patch_dataset import split
 from pnu.io import Mesh, meshes_of, read_mesh
+from pnu.io.cloud import columns_of
 
 PARTS = ("train", "val", "test", "all")
 
@@ -32,6 +33,7 @@ def source(
     truth_points: int = 20000,
     seed: int = 0,
     normals: bool = True,
+    columns: str | None = None,
     warn: Warn = print,
 ) -> Source:
     """Cases of `data`, drawn as they are asked for; what is wrong with the arguments is said at once.
@@ -47,6 +49,7 @@ def source(
         truth_points: evenly spread on the true surface, to compare with.
         seed: of all that is drawn.
         normals: whether inputs have normals.
+        columns: of prepared clouds that are text or arrays without names, such as "x,y,z,_,nx,ny,nz".
     """
     if unknown := [kind for kind in kinds if kind not in KINDS]:
         raise ValueError(f"kinds={unknown[0]}: expected some of {', '.join(KINDS)}")
@@ -58,8 +61,12 @@ def source(
     options: dict[str, Any] = {"truth_points": truth_points, "seed": seed, "normals": normals, "warn": warn}
     if data.get("root") and is_pairs_folder(data["root"]):
         root = Path(data["root"])
-        names = chosen([path.stem for path in pair_files(root)], data, part or "all", only)
-        return Source(root.resolve().name, names, ["given"], pair_cases(root, names, **options))
+        paths = pair_files(root)
+        names = chosen([path.stem for path in paths], data, part or "all", only)
+        columns_of([path for path in paths if path.stem in names], columns, f"{root}/clouds")
+        return Source(root.resolve().name, names, ["given"], pair_cases(root, names, columns=columns, **options))
+    if columns is not None:
+        raise ValueError(f"columns={columns}: is for prepared pairs, data=meshes data.root=FOLDER with clouds/, truth/")
     makers: dict[str, Callable[[], Mesh]]
     if data.get("root"):
         name, part = Path(data["root"]).resolve().name, part or "all"

@@ -15,6 +15,7 @@ from pnu.geometry.mesh_topology import open_edges
 from pnu.geometry.sampling import nonuniform_points
 from pnu.geometry.unit_sphere import Frame
 from pnu.io import CLOUD_SUFFIXES, MESH_SUFFIXES, Mesh, files_of, read_cloud, read_mesh
+from pnu.io.cloud import columns_of
 
 KINDS = ("uniform", "random", "nonuniform", "sparse", "noise_0.5", "noise_1")
 """Kinds of input: evenly spread (Poisson-disk), random by area, denser around three places, evenly spread with a
@@ -100,6 +101,7 @@ def pair_cases(
     truth_points: int = 20000,
     seed: int = 0,
     normals: bool = True,
+    columns: str | None = None,
     warn: Warn = print,
 ) -> Iterator[Case]:
     """Prepared pairs of a folder: clouds/NAME.xyz (or ply ...) and truth/NAME.ply, the true mesh in the same frame.
@@ -108,14 +110,15 @@ def pair_cases(
     mesh it is the truth. Of several, that of `truth_points` is taken, or the largest. Both are brought to the truth's
     unit sphere if they are not in one.
 
+    columns: of clouds that are text or arrays without names, as `pnu.io.read_cloud` takes them.
+
     Raises:
         ValueError: cloud, mesh and samples are not in one frame, or two files have the same name.
     """
-    for path in pair_files(root):
-        if shapes is not None and path.stem not in shapes:
-            continue
+    paths = [path for path in pair_files(root) if shapes is None or path.stem in shapes]
+    for path, names in zip(paths, columns_of(paths, columns, f"{root}/clouds"), strict=True):
         truth, frame = read_truth(Path(root) / "truth", path.stem, truth_points, seed, warn)
-        points, given, _, notes = read_cloud(path, normals=normals)
+        points, given, _, notes = read_cloud(path, normals=normals, columns=names)
         for note in notes:
             warn(f"{path}: {note}")
         points = moved(points, frame)

@@ -5,7 +5,7 @@ import sys
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from pnu.commands._entry import command
 from pnu.config.instantiate import find_metric
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 class Compare:
     """Evaluate several methods on the same clouds; write a page with tables, surfaces and 3D views. Trains nothing."""
 
+    commas: ClassVar = ("columns",)
     methods: list[str] = doc(
         "run folders, folders of a sweep, and apss, poisson, midpoint; NAME:FOLDER gives a run another name"
     )
@@ -35,6 +36,9 @@ class Compare:
     )
     points: int = doc("points of an input cloud")
     truth_points: int = doc("points on the true surface to compare with")
+    columns: str | None = doc(
+        "of prepared pairs' text, or arrays without names: x,y,z,_,nx,ny,nz; null: by their names or the usual order"
+    )
     ratio: float = doc("points out for each point in")
     passes: bool = doc("also networks that were trained for another ratio: by passes and farthest points")
     normals: str = doc("of the inputs: given, those of the shape; estimate, for which surface_estimated is made")
@@ -65,7 +69,7 @@ def compare(cfg: Any) -> None:
     chosen = metrics.with_own(cfg.metrics, functools.partial(find_metric, allow=cfg.allow))
     source = benchmark.source(
         cfg.data, cfg.kinds, part=cfg.part, only=cfg.shapes, points=cfg.points, truth_points=cfg.truth_points,
-        seed=cfg.seed, normals=cfg.normals == "given", warn=warn,
+        seed=cfg.seed, normals=cfg.normals == "given", columns=cfg.columns, warn=warn,
     )  # fmt: skip
     rebuilt_kinds = source.kinds[:1] if cfg.surfaces is None else list(cfg.surfaces)
     if unknown := [kind for kind in rebuilt_kinds if kind not in source.kinds]:

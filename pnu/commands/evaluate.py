@@ -23,6 +23,7 @@ class Evaluate:
     """Upsample whole clouds of several kinds and measure them against the truth: tables. `model=NAME` is `run=NAME`."""
 
     also: ClassVar = {"model": "run"}
+    commas: ClassVar = ("columns",)
     run: str | None = doc(
         "run folder, or name or file of weights; newest: the run that finished last; null: `method`, or surface"
     )
@@ -37,6 +38,9 @@ class Evaluate:
     )
     points: int = doc("points of an input cloud")
     truth_points: int = doc("points on the true surface to compare with")
+    columns: str | None = doc(
+        "of prepared pairs' text, or arrays without names: x,y,z,_,nx,ny,nz; null: by their names or the usual order"
+    )
     ratio: float = doc("points out for each point in")
     passes: bool = doc("also where the network was trained for another ratio: by passes and farthest points")
     normals: str = doc("of the inputs: given, those of the shape; estimate, for which run=surface_estimated is made")
@@ -65,7 +69,7 @@ def evaluate(cfg: Any) -> None:
     chosen = metrics.with_own(cfg.metrics, functools.partial(find_metric, allow=cfg.allow))
     source = benchmark.source(
         cfg.data, cfg.kinds, part=cfg.part, only=cfg.shapes, points=cfg.points, truth_points=cfg.truth_points,
-        seed=cfg.seed, normals=cfg.normals == "given", warn=warn,
+        seed=cfg.seed, normals=cfg.normals == "given", columns=cfg.columns, warn=warn,
     )  # fmt: skip
     subject = cfg.method or str(checkpoints.resolve(cfg.run or DEFAULT[cfg.normals]))
     model = classical(subject) if cfg.method else checkpoints.load(subject, cfg.allow)
@@ -105,6 +109,7 @@ def evaluate(cfg: Any) -> None:
         benchmark.print_tables(rows, f"{subject}, normals of the input {NORMALS[cfg.normals]}. {made}", chosen)
         print(f"output: {output}/metrics.json, metrics.csv{', clouds/' if cfg.save else ''}")
         data = {"data": "meshes", "data.root": cfg.data.root} if cfg.data.get("root") else {}
+        data |= {"columns": cfg.columns} if cfg.columns else {}
         rival = "poisson" if subject == "apss" else "apss"
         print(f"next:   {shell_line('compare', methods=[subject, rival], **data)}")
 

@@ -17,7 +17,10 @@ class Picture:
     inputs: list[str] = doc("files to draw, a panel each: [a.ply,b.obj,...]; with faces as meshes, others as clouds")
     output: str = doc("png to write")
     captions: list[str] | None = doc("a caption for each panel; null: the names of the files")
-    columns: str | None = doc("panels in a row, null: all, up to six; or, as x,y,z,_,r,g,b, those of text files")
+    panels: int | None = doc("in a row; null: all, up to six")
+    columns: str | None = doc(
+        "of text, or an array without names: x,y,z,_,r,g,b (_ is left out); null: by its names or the usual order"
+    )
     color: str = doc("auto: the first that a file has; quality: scalar of that name; stored; normal; plain")
     colormap: str = doc("of quality. error: red = zero to blue = high; perceptual: dark to light")
     limit: float | None = doc("quality at the end of the colors; null: what 98 % of the points stay below")
@@ -38,7 +41,7 @@ def picture(cfg: Any) -> None:
     """Draw the files side by side."""
     from pnu import rendering
     from pnu.io import check_writable
-    from pnu.io.cloud import TABLES
+    from pnu.io.cloud import columns_of
     from pnu.rendering.colors import COLORMAPS
     from pnu.rendering.file_panels import COLORS, quality_bar, read_shape
 
@@ -56,16 +59,19 @@ def picture(cfg: Any) -> None:
     for name, value in (("limit", cfg.limit), ("radius", cfg.radius)):
         if value is not None and not value > 0:
             raise ValueError(f"{name}={value:g}: expected a number above 0")
-    number = cfg.columns is not None and cfg.columns.lstrip("-").isdecimal()
-    if number and int(cfg.columns) < 1:
-        raise ValueError(f"columns={cfg.columns}: expected a number above 0, or names such as x,y,z,_,r,g,b")
-    across, columns = (int(cfg.columns), None) if number else (None, cfg.columns)
+    if cfg.panels is not None and cfg.panels < 1:
+        raise ValueError(f"panels={cfg.panels}: expected a number above 0, the panels in a row")
+    if cfg.columns is not None and cfg.columns.lstrip("-").isdecimal():
+        raise ValueError(
+            f"columns={cfg.columns}: expected names such as x,y,z,_,r,g,b; panels={cfg.columns} puts as many in a row"
+        )
     if not 16 <= cfg.size <= 4096:
         raise ValueError(f"size={cfg.size}: expected 16 to 4096 pixels")
     if Path(cfg.output).suffix.lower() != ".png":
         raise ValueError(f"output={cfg.output}: expected a name that ends in .png")
     check_writable(cfg.output)
-    shapes = [read_shape(path, columns if Path(path).suffix.lower() in TABLES else None) for path in inputs]
+    columns = columns_of(inputs, cfg.columns, "inputs")
+    shapes = [read_shape(path, names) for path, names in zip(inputs, columns, strict=True)]
     bar = quality_bar(shapes, cfg.color, cfg.limit, cfg.colormap, cfg.label)
     points = [shape.points for shape in shapes]
     apart = cfg.fit is None and not rendering.in_one_place(*points)
@@ -77,7 +83,7 @@ def picture(cfg: Any) -> None:
         for shape, camera in zip(shapes, cameras, strict=True)
     ]
     names = [Path(path).stem for path in inputs] if captions is None else list(captions)
-    image = rendering.figure(panels, names, columns=across, colorbar=bar)
+    image = rendering.figure(panels, names, columns=cfg.panels, colorbar=bar)
     rendering.save_png(cfg.output, image)
     if not cfg.quiet:
         kinds = (f"{'mesh' if s.mesh is not None else 'cloud'}, color={s.source(cfg.color)}" for s in shapes)

@@ -95,7 +95,8 @@ def reconstruct(cfg: Any) -> None:
         say(f"        {note}")
     for text in describe_cloud(points, normals).warnings():
         warn(text)
-    say(f"next:   {shell_line('picture', inputs=[cfg.input, cfg.output], output='picture.png')}")
+    names = {"columns": cfg.columns} if cfg.columns else {}
+    say(f"next:   {shell_line('picture', inputs=[cfg.input, cfg.output], output='picture.png', **names)}")
 
 
 def check_options(cfg: Any) -> None:

@@ -65,6 +65,20 @@ def read_cloud(
     return check_cloud(cloud, str(path), minimum=minimum)
 
 
+def columns_of(paths: Sequence[str | Path], columns: str | None, name: str) -> list[str | None]:
+    """What `read_cloud` takes as `columns` for each of several files: null for those that have names of their own.
+
+    `ValueError`, beginning with `columns=`, where they are no names or none of the files takes them; `name`: of all.
+    """
+    if columns is None:
+        return [None] * len(paths)
+    spelled(columns)
+    found = [columns if Path(path).suffix.lower() in TABLES else None for path in paths]
+    if not any(found):
+        raise ValueError(f"columns={columns}: is for text and arrays without names, and {name} has none of them")
+    return found
+
+
 @np.errstate(invalid="ignore", over="ignore")
 def check_cloud(cloud: Cloud, name: str, *, minimum: int = 16) -> Cloud:
     """The cloud as everything after it takes it, with a note for each thing that was changed.
