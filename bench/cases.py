@@ -17,24 +17,25 @@ def contents(cloud: Cloud) -> str:
     return ", ".join([*parts, *(["colors"] if "colors" in cloud.attributes else []), *scalars])
 
 
-def row(path: Path) -> str:
+def row(path: Path, name: str) -> str:
     try:
         cloud = read_cloud(path)
         read, said = contents(cloud), [*cloud.notes, *describe_cloud(cloud.points, cloud.normals).warnings()]
     except (ValueError, OSError) as error:
         read, said = "refused", [str(error).removeprefix(f"{path}: ")]
-    return f"| {path.name} | {read} | {'<br>'.join(said).replace('|', '/')} |"
+    return f"| {name} | {read} | {'<br>'.join(said).replace('|', '/')} |"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="whose files are read, those of its folders too")
-    files = files_of(parser.parse_args().folder, CLOUD_SUFFIXES)
+    folder = parser.parse_args().folder
+    files = files_of(folder, CLOUD_SUFFIXES, below=True)
     if not files:
         sys.exit("error: no point clouds there")
     print("| file | read | said |\n|---|---|---|")
     for path in files:
-        print(row(path), flush=True)
+        print(row(path, path.relative_to(folder).as_posix()), flush=True)
 
 
 if __name__ == "__main__":
