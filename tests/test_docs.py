@@ -189,6 +189,46 @@ def test_modules_named_on_a_page_exist(page: str) -> None:
         assert verb in verbs(), verb
 
 
+MADE = re.compile(
+    r"^Revisions? (not recorded|unknown|version \S+|[0-9a-f]{10}\+?( and [0-9a-f]{10}\+?)*); .+; "
+    r"(single seeds|\d+ seeds|\d+ to \d+ seeds)\.$",
+    re.M,
+)
+TABLE = re.compile(r"(?:^\|.*\|\n)+", re.M)
+
+
+def unexplained(page: str) -> list[str]:
+    """First lines of the tables of measurements that no line on their making precedes or follows in their section.
+
+    A table of measurements is one in whose columns behind the first two cells of five begin with a number.
+    """
+    found = []
+    for section in re.split(r"^#+ .*\n", BLOCK.sub("", page), flags=re.M):
+        tables = []
+        for table in TABLE.findall(section):
+            cells = [cell.strip(" *") for row in table.splitlines()[2:] for cell in row.split("|")[2:-1]]
+            if sum(bool(re.match(r"[+-]?\d", cell)) for cell in cells) > 0.4 * len(cells):
+                tables.append(table.partition("\n")[0])
+        found += tables[len(MADE.findall(section)) :]
+    return found
+
+
+def test_a_table_of_measurements_is_known_as_such() -> None:
+    table = "| a | b |\n|---|---|\n| x | 0.12 s |\n| y | **3.4** |\n"
+    line = "Revision 0123456789+; Xeon, 2 threads; single seeds.\n"
+    assert unexplained(f"## A\n\n{table}\n## B\n\n{line}") == ["| a | b |"]
+    assert unexplained(f"{line}\n{table}") == unexplained(f"{table}\n{line}") == []
+    assert unexplained(f"{table}\n{line}\n{table}") == ["| a | b |"]
+    assert unexplained("| a | b |\n|---|---|\n| x | `10` |\n| 1 | yes |\n") == []
+    measured = {page for page in PAGES if unexplained(MADE.sub("", text(page)))}
+    assert measured >= {"README.md", "docs/speed.md", "docs/surface.md", "docs/rivals.md", "docs/ablations/normals.md"}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_tables_of_measurements_say_how_they_were_made(page: str) -> None:
+    assert not unexplained(text(page))
+
+
 @pytest.mark.parametrize("own", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_example_goes_from_scan_to_mesh(own: bool, tmp_path: Path) -> None:
     given = []
