@@ -57,8 +57,21 @@ def test_each_thing_of_the_paper_is_where_the_map_says() -> None:
     for name in named:
         module, _, attribute = name.rpartition(".")
         assert callable(getattr(importlib.import_module(module), attribute)), name
-    for number in range(1, 8):
-        assert f"Eq. {number}" in text("docs/paper.md")
+
+
+def test_equations_have_the_numbers_of_the_map() -> None:
+    """Seven, the overall loss the last of them; what implements one says its number first."""
+    rows = re.findall(r"^\| Eq\. (\d)(.*)", text("docs/paper.md"), re.M)
+    assert [int(number) for number, _ in rows] == list(range(1, 8))
+    for number, row in rows:
+        for name in re.findall(r"`(pnu(?:\.\w+)+)`", row):
+            module, _, attribute = name.rpartition(".")
+            words = getattr(importlib.import_module(module), attribute).__doc__
+            assert re.findall(r"\bEq\. (\d+)", words)[0] == number, name
+    for path in [*ROOT.glob("pnu/**/*.py"), *ROOT.glob("conf/**/*.yaml"), *ROOT.glob("docs/**/*.md")]:
+        found = re.findall(r"\bEqs?\.[ ~(]*(\d+)(?: (?:to|and) (\d+))?", path.read_text(encoding="utf-8"))
+        assert {int(number) for pair in found for number in pair if number} <= set(range(1, 8)), path
+    assert re.findall(r"\(Eq\. (\d)\)", text("conf/loss/compound.yaml")) == ["7"]
 
 
 def released_checkpoint(path: Path) -> None:

@@ -37,7 +37,7 @@ class Patches(NamedTuple):
 
     clouds: np.ndarray  # (p, 4096, 6) float32, points in the frame of the shape and unit normals
     edges: np.ndarray  # (p, 256, 3) float32, points on the sharp edges near the patch, NaN where there are fewer
-    open_edges: int  # of the mesh, see `ops.mesh.open_edges`
+    open_edges: int  # of the mesh, see `pnu.geometry.mesh_topology.open_edges`
 
 
 def cut_patches(mesh: Mesh, count: int, rng: np.random.Generator) -> Patches:

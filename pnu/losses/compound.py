@@ -81,8 +81,9 @@ def chamfer(prediction: Tensor, target: Tensor, matches: Matches, reduction: Red
 def emd(prediction: Tensor, target: Tensor, reduction: Reduction = "mean") -> Tensor:
     """Eq. 2: distance of each prediction to the target that a nearly shortest one-to-one matching gives it.
 
-    The matching is found by auction (`ops.transport.assign`): 2 % too long where the clouds are near, 9 % for unrelated
-    ones. It costs 0.3 to 0.6 s for each cloud of 4096 points on one CPU thread, many times the other terms together.
+    The matching is found by auction (`pnu.geometry.assignment.assign`): 2 % too long where the clouds are near, 9 % for
+    unrelated ones. It costs 0.3 to 0.6 s for each cloud of 4096 points on one CPU thread, many times the other terms
+    together.
     """
     a, b = prediction[..., :3], target[..., :3]
     offsets = a - gather(b, assign(a, b))
@@ -130,7 +131,7 @@ def normal_knn(prediction: Tensor, around: Tensor, reduction: Reduction = "mean"
 
 
 class CompoundLoss(nn.Module):
-    """w1 CD + w2 point_knn + w3 normal + w4 normal_orth + w5 normal_knn (Eq. 8).
+    """w1 CD + w2 point_knn + w3 normal + w4 normal_orth + w5 normal_knn (Eq. 7).
 
     Defaults are the released code's, and the weights are the paper's. Every term is computed at every step, whatever
     its weight.
