@@ -11,15 +11,19 @@ import numpy as np
 import pytest
 import torch
 
+from pnu.commands.train import main as train
 from pnu.data import shapes
 from pnu.data.crop_module import ProjectionDataModule
 from pnu.data.crops import Crops, WholeClouds, flattened
 from pnu.data.mesh_scene import MeshScene
+from pnu.data.patch_module import PatchDataModule
 from pnu.geometry.mesh_sampling import closest_points, face_normals, sample_area
-from pnu.io import Mesh, write_mesh
+from pnu.io import Mesh, read_json, write_mesh
 from pnu.losses.projection import SurfaceLoss
+from pnu.networks.pnu import PNU
 from pnu.networks.surface import Surface
-from pnu.training.lightning_module import TRAINER_OPTIONS, quieten
+from pnu.training.lightning_module import TRAINER_OPTIONS, check_input, quieten
+from tests.commands import refused
 
 NAMES = sorted(shapes.names())[:2] + sorted(shapes.names("cad"))[-1:]
 
@@ -250,6 +254,31 @@ def test_a_training_with_accumulated_gradients_goes_on_with_the_rest(stop: int, 
 def test_bad_options_are_refused_before_the_training(options: dict[str, Any], message: str, folder: Path) -> None:
     with pytest.raises(ValueError, match=message):
         data_module(folder, **options).setup()
+
+
+def test_more_queries_than_a_crop_has_room_for_are_refused_before_anything_is_drawn(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(ProjectionDataModule, "setup", lambda *_: pytest.fail("data were made"))
+    given = [
+        "experiment=surface",
+        "data.root=null",
+        "data.validation=[mug]",
+        "data.size=128",
+        "trainer.accelerator=cpu",
+    ]
+    line = refused(capsys, train, [*given, "model.queries=385", "run=failed", "quiet=true"])
+    expected = "model.queries=385: expected at most 3 times the points of a training input, data.size=128"
+    assert expected in line
+    assert read_json(tmp_path / "failed" / "run.json")["status"] == "failed"
+    Surface(queries=384).check_input("data.size", 128)
+    with pytest.raises(ValueError, match=r"model\.queries=0: expected at least 1"):
+        Surface(queries=0)
+    for data, key in ((PatchDataModule(input_points=64), "data.input_points"), (data_module(tmp_path), "data.size")):
+        with pytest.raises(ValueError, match=rf"training input, {key}=64"):
+            check_input(Surface(queries=193), data)
+    check_input(PNU(), PatchDataModule(input_points=64))
 
 
 @pytest.mark.parametrize(("size", "normals"), [(600, "given"), (600, "estimated"), (16, "estimated")])

@@ -64,6 +64,7 @@ def train(cfg: Any) -> list[float] | None:
             for group in ("data", "loss", "optimizer", "scheduler")
         }
         model, data = networks.build_network(config["model"], allow), parts.pop("data")
+        lightning_module.check_input(model, data)
         if source := config.get("weights"):
             checkpoints.fill(model, checkpoints.load(source, allow).state_dict(), source)
         find = functools.partial(find_metric, allow=allow)

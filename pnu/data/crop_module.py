@@ -44,6 +44,11 @@ class ProjectionDataModule(EpochDataModule):
         self.normals, self.clouds, self.size, self.views, self.points = normals, clouds, size, views, points
         self.truth: MeshScene | None = None
 
+    @property
+    def input_size(self) -> tuple[str, int]:
+        """Those of a crop."""
+        return "data.size", self.size
+
     def setup(self, stage: str | None = None) -> None:
         if self.truth is not None:
             return

@@ -49,6 +49,11 @@ class EpochDataModule(pl.LightningDataModule):
         """Number of this process and how many there are."""
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
 
+    @property
+    def input_size(self) -> tuple[str, int] | None:
+        """The key that sets the points of a training input, and how many they are; None where no key does."""
+        return None
+
     def check_batch_size(self, samples: int, source: str) -> None:
         """ValueError where the training samples do not fill one batch of every process."""
         _, world = self.process
@@ -147,6 +152,11 @@ class PatchDataModule(EpochDataModule):
         self.augmentation = from_options(augmentation)
         self.shares = {"val": val_share, "test": test_share}
         self.rows: dict[str, list[int]] | None = None
+
+    @property
+    def input_size(self) -> tuple[str, int]:
+        """Those of the input patches, which are drawn from the file's."""
+        return "data.input_points", self.options.input_points
 
     def patch_file(self) -> Path:
         """The file of patches, made where it is not there yet."""

@@ -109,10 +109,18 @@ class Surface(nn.Module):
             raise ValueError(f"model.reach={reach}: expected at least model.neighbors={neighbors}, which is at least 4")
         if reject < 0:
             raise ValueError(f"model.reject={reject}: expected a share of the points, 0 or more")
-        for name in ("rounds", "seeds", "candidates", "shortlist", "refinements"):
+        for name in ("rounds", "seeds", "candidates", "shortlist", "refinements", "queries"):
             if getattr(self, name) < 1:  # too few seeds would be too few points
                 raise ValueError(f"model.{name}={getattr(self, name)}: expected at least 1")
         self.projector = Projector(width, sphere=sphere, attention=attention)
+
+    def check_input(self, key: str, points: int) -> None:
+        """`ValueError` where training inputs of so many points, set by `key`, have no room for the queries."""
+        if self.queries > EACH * points:
+            raise ValueError(
+                f"model.queries={self.queries}: expected at most {EACH} times the points of a training input, "
+                f"{key}={points}"
+            )
 
     def outputs(self, patch: Tensor) -> dict[str, Tensor]:
         """Training: a seed for each of the first `queries` points of patches (B, n, 6), projected `rounds` times.
@@ -135,12 +143,8 @@ class Surface(nn.Module):
 
         As at work seeds are thinned out, so that many lie in holes and beyond edges, and pushed on between rounds.
         """
+        self.check_input("points", patch.shape[1])
         count = self.queries
-        if count > EACH * patch.shape[1]:
-            raise ValueError(
-                f"model.queries={count}: expected at most {EACH} times the points of a crop, found {patch.shape[1]}"
-                " points; raise data.size"
-            )
         discs = torch.stack([tangent_discs(p[:, :3], p[:, 3:], EACH, first=count) for p in patch])
         parents = patch[:, :count, None].expand(-1, -1, EACH, -1)
         seeds = torch.cat([discs, parents[..., 3:]], -1).flatten(1, 2)

@@ -87,6 +87,13 @@ def misconfigured() -> Iterator[None]:
         raise ValueError(f"trainer: {' '.join(str(error).split())}") from error
 
 
+def check_input(model: nn.Module, data: pl.LightningDataModule) -> None:
+    """`ValueError` where a network cannot be trained with inputs of the data's size, before any are made."""
+    check, size = getattr(model, "check_input", None), getattr(data, "input_size", None)
+    if check and size:
+        check(*size)
+
+
 class NonFinite(ValueError):
     """NaN or infinity in the loss or its gradient; the message names the step and the term."""
 
