@@ -309,6 +309,26 @@ def test_a_failing_job_is_told_at_once_and_the_others_go_on(
 # --- Ctrl-C ---
 
 
+def started(
+    patch_file: Path,  # noqa: F811
+    folder: Path,
+    more: list[str],
+    jobs: int,
+) -> tuple[list[str], subprocess.Popen[str]]:
+    """The line and the process of a sweep without end, as many jobs of which have written a checkpoint."""
+    line = [*small(patch_file), "seed=0,1,2", "sweep=a sweep", "trainer.max_steps=-1", "trainer.max_epochs=100000"]
+    line += ["trainer.val_check_interval=1000", "callbacks.checkpoints.every_n_steps=1", *more]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "pnu.train", *line],
+        **{"cwd": folder, "env": {**os.environ, "OMP_NUM_THREADS": "1"}, "text": True, "start_new_session": True},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    while len(list(folder.glob("outputs/sweeps/*/*/checkpoints/last.ckpt"))) < jobs and process.poll() is None:
+        time.sleep(0.05)
+    return line, process
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("untraced")
 @pytest.mark.parametrize("launcher", ["basic", "joblib"])
@@ -316,21 +336,12 @@ def test_a_failing_job_is_told_at_once_and_the_others_go_on(
 def test_interrupted_with_a_launcher(launcher: str, whom: str, patch_file: Path, tmp_path: Path) -> None:  # noqa: F811
     """Ctrl-C reaches all processes of a terminal, `kill -INT` the first alone: no traceback, a summary, the line to go
     on with, exit code 130, and no job that runs for ever."""
-    line = [*small(patch_file), "seed=0,1,2", "sweep=a sweep", "trainer.max_steps=-1", "trainer.max_epochs=100000"]
-    line += ["trainer.val_check_interval=1000", "callbacks.checkpoints.every_n_steps=1"]
+    more, jobs = [], 1
     if launcher == "joblib":
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-        line += ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "pnu.train", *line],
-        **{"cwd": tmp_path, "env": {**os.environ, "OMP_NUM_THREADS": "1"}, "text": True, "start_new_session": True},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
+        more, jobs = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"], 2
+    line, process = started(patch_file, tmp_path, more, jobs)
     folder = tmp_path / "outputs" / "sweeps" / "a sweep"
-    jobs = 2 if launcher == "joblib" else 1
-    while len(list(folder.glob("*/checkpoints/last.ckpt"))) < jobs and process.poll() is None:
-        time.sleep(0.05)
     (os.killpg if whom == "all" else os.kill)(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=300)
     assert process.returncode == 130
@@ -340,6 +351,30 @@ def test_interrupted_with_a_launcher(launcher: str, whom: str, patch_file: Path,
     assert err == f"stopped; go on with: python -m pnu.train {shlex.join(line)}\n"
     found = records(folder).values()
     assert [(record["status"], record["error"]) for record in found] == [("failed", "interrupted")] * jobs
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("untraced")
+@pytest.mark.parametrize("whom", ["all", "first"])
+def test_interrupted_with_submitit(whom: str, patch_file: Path, tmp_path: Path) -> None:  # noqa: F811
+    """Ctrl-C ends its jobs too, though its own processes print tracebacks; after `kill -INT` of the first process they
+    run on, as on a cluster, and the summary says so."""
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    more = ["hydra/launcher=submitit_local", "hydra.launcher.timeout_min=10"]
+    line, process = started(patch_file, tmp_path, more, jobs=3)
+    (os.killpg if whom == "all" else os.kill)(process.pid, signal.SIGINT)
+    try:
+        assert process.wait(timeout=300) == 130
+    finally:
+        if whom == "first":
+            os.killpg(process.pid, signal.SIGKILL)
+    out, err = process.communicate(timeout=300)
+    state = "interrupted" if whom == "all" else "running"
+    assert out == f"\nsweep folder: outputs/sweeps/a sweep (3 {state})\nnext: python -m pnu.train {shlex.join(line)}\n"
+    assert f"stopped; go on with: python -m pnu.train {shlex.join(line)}\n" in err
+    found = records(tmp_path / "outputs" / "sweeps" / "a sweep").values()
+    expected = ("failed", "interrupted") if whom == "all" else ("running", None)
+    assert [(record["status"], record.get("error")) for record in found] == [expected] * 3
 
 
 def test_a_job_whose_process_is_gone_does_not_run(tmp_path: Path) -> None:
