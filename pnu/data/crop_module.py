@@ -18,7 +18,8 @@ class ProjectionDataModule(EpochDataModule):
         root: folder of closed meshes, beside the procedural shapes; null: those alone
         procedural: train on the procedural shapes
         validation: names of the meshes kept for validation and test
-        normals: of the input: given, or estimated from its points
+        normals: of the input: given, estimated from its points, or mixed
+        scans: share of the clouds that are simulated scans
         clouds: of an epoch, each drawn anew
         size: points of a crop
         views: crops of a cloud
@@ -33,7 +34,7 @@ class ProjectionDataModule(EpochDataModule):
 
     def __init__(
         self, root: str | None = None, procedural: bool = True, validation: Iterable[str] = (),
-        normals: Literal["given", "estimated"] = "given", clouds: int = 6400, size: int = 384, views: int = 2,
+        normals: Literal["given", "estimated", "mixed"] = "given", scans: float = 0.0, clouds: int = 6400, size: int = 384, views: int = 2,
         batch_size: int = 8, points: int = 2048, workers: int = 0, seed: int = 0,
     ) -> None:  # fmt: skip
         super().__init__(batch_size, workers, seed)
@@ -41,6 +42,7 @@ class ProjectionDataModule(EpochDataModule):
             raise ValueError(f"data.points={points}: expected at least {SMALLEST}")
         self.evaluation_batch_size = 1
         self.root, self.procedural, self.held_out = root, procedural, list(validation)
+        self.scans = scans
         self.normals, self.clouds, self.size, self.views, self.points = normals, clouds, size, views, points
         self.truth: MeshScene | None = None
 
@@ -66,7 +68,7 @@ class ProjectionDataModule(EpochDataModule):
             raise ValueError(f"data.root={self.root}: expected meshes to train on, found none but those of validation")
         self.truth = MeshScene(list(meshes.values()))
         self.check_batch_size(self.clouds, f"data.clouds={self.clouds}")
-        train = Crops(meshes, self.clouds, size=self.size, views=self.views, normals=self.normals, seed=self.seed)
+        train = Crops(meshes, self.clouds, size=self.size, views=self.views, normals=self.normals, scans=self.scans, seed=self.seed)
         clouds = {
             part: WholeClouds(held_out, self.points, normals=self.normals, seed=seed)
             for part, seed in (("val", 1), ("test", 2))

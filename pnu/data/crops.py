@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from pnu.data.scanner import Scanner, any_scan
+from pnu.geometry.anisotropy import averaged, thinned_lines
 from pnu.geometry.mesh_sampling import sample_area, sample_poisson_disk
 from pnu.geometry.normal_estimation import estimate_normals, refit_normals
 from pnu.geometry.sampling import farthest_points_large
@@ -17,6 +19,9 @@ SIZES = (600, 8000)  # points of a cloud, evenly spread in the logarithm, for ha
 USUAL = (1500, 6500)  # and for the other half
 SMALLEST = 16  # points of a crop, or of a cloud for validation, from which surfaces can be told
 MARGIN = 32  # points beyond a crop that its estimated normals need
+TAKEN = 0.015  # distance from the surface up to which a point of a scan is taken for a measurement of it,
+OVERLOOKED = 0.03  # and the share of the others that stay, as where they are removed by their looks
+GIVEN = 0.3  # share of the crops that have true normals where normals="mixed"
 
 
 class Crops(Dataset[dict[str, Any]]):
@@ -25,7 +30,9 @@ class Crops(Dataset[dict[str, Any]]):
     A cloud has 600 to 8000 points, drawn evenly (65 %), unevenly (20 %) or as blue noise (15 %). With
     normals="given" they are true, in 15 % of the clouds a little off, and 20 % of the clouds have up to 1 % noise; with
     "estimated" they come from the cloud, with the true side, and half of the clouds have up to 2 % noise
-    (Gaussian, standard deviation in units of the shape's radius). Inside and outside are swapped in 30 %.
+    (Gaussian, standard deviation in units of the shape's radius); "mixed": estimated in 70 % of the crops. Inside and
+    outside are swapped in 30 %. A share `scans` of the clouds are simulated scans (`pnu.data.scanner`), most strays
+    removed and lines thinned out, as `pnu.upsample` does before the network sees them.
 
     An item is {"input": (views, size, 6) float32 around the "center" (views, 3), "target": the same points without
     noise, "side": (views,) 1 or -1 where swapped, "index": (views,) of the mesh, "shape": its name}, all from
@@ -34,10 +41,12 @@ class Crops(Dataset[dict[str, Any]]):
 
     def __init__(
         self, meshes: dict[str, Mesh], length: int, *, size: int = 384, views: int = 2, normals: str = "given",
-        seed: int = 0,
+        scans: float = 0.0, seed: int = 0,
     ) -> None:  # fmt: skip
-        if normals not in ("given", "estimated"):
-            raise ValueError(f"data.normals={normals}: expected given or estimated")
+        if normals not in ("given", "estimated", "mixed"):
+            raise ValueError(f"data.normals={normals}: expected given, estimated or mixed")
+        if not 0 <= scans <= 1:
+            raise ValueError(f"data.scans={scans}: expected a share from 0 to 1")
         if not SMALLEST <= size <= SIZES[0]:
             raise ValueError(
                 f"data.size={size}: expected {SMALLEST} to {SIZES[0]}, the points of the smallest clouds that are drawn"
@@ -46,7 +55,8 @@ class Crops(Dataset[dict[str, Any]]):
             raise ValueError(f"data: expected clouds >= 1 and views >= 1, found {length} and {views}")
         self.names, self.meshes = list(meshes), list(meshes.values())
         self.length, self.size, self.views = length, size, views
-        self.estimated, self.seed = normals == "estimated", seed
+        self.estimated, self.mixed, self.scans, self.seed = normals != "given", normals == "mixed", scans, seed
+        self.scanners = [Scanner(mesh) for mesh in self.meshes]
 
     def __len__(self) -> int:
         return self.length
@@ -55,17 +65,25 @@ class Crops(Dataset[dict[str, Any]]):
         epoch, index = key
         rng = np.random.default_rng((self.seed, epoch, index))
         shape = int(rng.integers(len(self.meshes)))
-        clean, noisy = self.cloud(self.meshes[shape], rng)
-        views = [self.crop(clean, noisy, rng) for _ in range(self.views)]
+        if self.scans and rng.random() < self.scans:
+            clean, noisy = self.scanned(self.scanners[shape], rng)
+        else:
+            clean, noisy = self.cloud(self.meshes[shape], rng)
+        rough = rough_normals(noisy[:, :3], clean[:, 3:]) if self.mixed else None
+        views = [self.crop(clean, noisy, rng, rough) for _ in range(self.views)]
         return {**stacked(views), "index": torch.full((self.views,), shape), "shape": [self.names[shape]] * self.views}
 
-    def crop(self, clean: np.ndarray, noisy: np.ndarray, rng: np.random.Generator) -> dict[str, Any]:
+    def crop(
+        self, clean: np.ndarray, noisy: np.ndarray, rng: np.random.Generator, rough: np.ndarray | None = None
+    ) -> dict[str, Any]:
         center = noisy[rng.integers(len(noisy)), :3]
-        size = min(self.size + (MARGIN if self.estimated else 0), len(noisy))
+        size = min(self.size + (MARGIN if self.estimated and rough is None else 0), len(noisy))
         distance = np.linalg.norm(noisy[:, :3] - center, axis=1)
         near = np.argpartition(distance, size - 1)[:size]
         near = near[np.argsort(distance[near])]
-        if self.estimated:
+        if rough is not None:
+            normals = noisy[near, 3:] if rng.random() < GIVEN else rough[near]
+        elif self.estimated:
             normals = rough_normals(noisy[near, :3], clean[near, 3:])
         else:
             normals = noisy[near, 3:]
@@ -77,6 +95,19 @@ class Crops(Dataset[dict[str, Any]]):
             "input": torch.from_numpy(crop).float(), "target": torch.from_numpy(target).float(),
             "center": torch.from_numpy(center), "side": side,
         }  # fmt: skip
+
+    def scanned(self, scanner: Scanner, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """A simulated scan of enough points, (n, 6) with true normals: the surface points meant, and those measured."""
+        while True:
+            scan = any_scan(scanner, rng)
+            seen = np.linalg.norm(scan.points - scan.clean[:, :3], axis=1) < TAKEN
+            seen |= np.isfinite(scan.clean[:, 0]) & (rng.random(len(seen)) < OVERLOOKED)
+            points, clean = scan.points[seen], scan.clean[seen]
+            rows = thinned_lines(points)
+            if rows is not None:
+                points, clean = averaged(points, rows), clean[rows]
+            if len(points) >= SIZES[0] + MARGIN:
+                return clean, np.hstack([points, clean[:, 3:]])
 
     def cloud(self, mesh: Mesh, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """A cloud (n, 6) with true normals, and the same with the noise of an input."""
@@ -124,7 +155,7 @@ class WholeClouds(Dataset[dict[str, Any]]):
         for index, (name, mesh) in enumerate(meshes.items()):
             rng = np.random.default_rng((seed, index))
             cloud = sample_area(mesh, n, rng)
-            if normals == "estimated":
+            if normals != "given":
                 cloud[:, 3:] = rough_normals(cloud[:, :3], cloud[:, 3:])
             target = sample_poisson_disk(mesh, 4 * n, rng)
             arrays = {"input": cloud, "target": target}

@@ -1,6 +1,6 @@
 """The true surfaces that training compares with: exact closest points on many meshes at once."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ class MeshScene:
     def closest(self, points: Tensor, shape: Tensor) -> tuple[Tensor, Tensor]:
         """Closest points of surfaces and their normals, (B, m, 3) each, for points (B, m, 3) of meshes `shape` (B,)."""
         if self.scene is None:
-            self.scene = self._build()
+            self.scene = ray_casting_scene(self.meshes, self.places)
         import open3d
 
         places = self.places[shape.cpu().numpy()][:, None]
@@ -36,18 +36,20 @@ class MeshScene:
         normals = found["primitive_normals"].numpy()
         return torch.from_numpy(closest).to(points), torch.from_numpy(normals).to(points)
 
-    def _build(self) -> Any:
-        try:
-            import open3d
-        except ImportError as error:
-            raise ValueError("data: training the surface model needs open3d; pip install open3d") from error
-        scene = open3d.t.geometry.RaycastingScene()
-        for mesh, place in zip(self.meshes, self.places, strict=True):
-            scene.add_triangles(
-                open3d.core.Tensor.from_numpy((mesh.vertices + place).astype(np.float32)),
-                open3d.core.Tensor.from_numpy(mesh.faces.astype(np.uint32)),
-            )
-        return scene
-
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "scene": None}  # a scene cannot be pickled
+
+
+def ray_casting_scene(meshes: Sequence[Mesh], places: Iterable[np.ndarray]) -> Any:
+    """A scene of Open3D with the meshes at their places (3,)."""
+    try:
+        import open3d
+    except ImportError as error:
+        raise ValueError("data: training the surface model needs open3d; pip install open3d") from error
+    scene = open3d.t.geometry.RaycastingScene()
+    for mesh, place in zip(meshes, places, strict=True):
+        scene.add_triangles(
+            open3d.core.Tensor.from_numpy((mesh.vertices + place).astype(np.float32)),
+            open3d.core.Tensor.from_numpy(mesh.faces.astype(np.uint32)),
+        )
+    return scene

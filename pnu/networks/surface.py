@@ -87,6 +87,8 @@ class Surface(nn.Module):
         refinements: projections after the even spacing; one more is nearer to the surface and a little less even
         reject: share of points made too many; the worst of their surroundings by expected error are dropped
         queries: seeds of a crop, in training
+        smoothing: share of the crops in training whose inner points are themselves projected first, as those of a noisy
+            cloud are at work
         sphere: start from the sphere that fits the neighbors (algebraic point set surface), not from the seed
         attention: weigh the neighbors; without it all count alike
     """
@@ -99,7 +101,7 @@ class Surface(nn.Module):
         self, ratio: int = 4, neighbors: int = 24, reach: int = 24, width: int = 64, rounds: int = 2,
         seeds: float = 4, candidates: float = 2, shortlist: float = 1.15,
         relaxation: int = 2, refinements: int = 2, reject: float = 0.003,
-        queries: int = 64, sphere: bool = True, attention: bool = True,
+        queries: int = 64, smoothing: float = 0.0, sphere: bool = True, attention: bool = True,
     ) -> None:  # fmt: skip
         super().__init__()
         self.ratio, self.neighbors, self.reach, self.rounds = ratio, neighbors, reach, rounds
@@ -112,6 +114,9 @@ class Surface(nn.Module):
         for name in ("rounds", "seeds", "candidates", "shortlist", "refinements", "queries"):
             if getattr(self, name) < 1:  # too few seeds would be too few points
                 raise ValueError(f"model.{name}={getattr(self, name)}: expected at least 1")
+        if not 0 <= smoothing <= 1:
+            raise ValueError(f"model.smoothing={smoothing}: expected a share from 0 to 1")
+        self.smoothing = smoothing
         self.projector = Projector(width, sphere=sphere, attention=attention)
 
     def check_input(self, key: str, points: int) -> None:
@@ -128,6 +133,7 @@ class Surface(nn.Module):
         "query" and "projected" (rounds, B, queries, 6) before and after each round, "log_error" and "spacing"
         (rounds, B, queries); "prediction" is the last of "projected". A query has no gradient.
         """
+        patch = self.with_some_smoothed(patch)
         query, outward = self.training_seeds(patch)
         found: list[tuple[Tensor, ...]] = []
         for _ in range(self.rounds):
@@ -137,6 +143,15 @@ class Surface(nn.Module):
         names = ("query", "projected", "log_error", "spacing")
         outputs = dict(zip(names, (torch.stack(values) for values in zip(*found, strict=True)), strict=True))
         return outputs | {"prediction": outputs["projected"][-1]}
+
+    @torch.no_grad()
+    def with_some_smoothed(self, patch: Tensor) -> Tensor:
+        """Patches (B, n, 6), the nearer half of the points of the first of them projected, a share of `smoothing`."""
+        some, inner = round(self.smoothing * len(patch)), patch.shape[1] // 2
+        if not some:
+            return patch
+        smooth, _, _ = self.project(patch[:some, :inner], patch[:some])
+        return torch.cat([torch.cat([smooth, patch[:some, inner:]], 1), patch[some:]])
 
     def training_seeds(self, patch: Tensor) -> tuple[Tensor, Tensor]:
         """Seeds around the first points of patches (B, n, 6), (B, queries, 6), and a push of each, (B, queries, 6).

@@ -1,0 +1,47 @@
+"""Clouds that are dense along lines and sparse across them, as laser scanners give them: found, and evened out."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from pnu.geometry.sampling import farthest_points_large
+
+AROUND = 8  # neighbors whose spread is looked at
+PLACES = 2000
+LINED = 0.3  # of `evenness`; random, even and uneven points of a surface stay above 0.5
+EVEN = 0.5
+SHARES = tuple(2 ** (-i / 4) for i in range(2, 21))  # of the points, that may be kept: 0.7 to 0.03
+
+
+def evenness(points: NDArray) -> float:
+    """Spread of the nearest neighbors across, over along their main direction, at the median of 2000 places.
+
+    About 0.6 for the points (n, 3) of a surface, drawn at random or evenly; 0.1 and less on lines.
+    """
+    tree = cKDTree(points)
+    near = points[tree.query(points[:: -(-len(points) // PLACES)], min(AROUND + 1, len(points)))[1]]
+    near = near - near.mean(1, keepdims=True)
+    size = np.sqrt(np.maximum(np.linalg.eigvalsh(near.transpose(0, 2, 1) @ near), 0))
+    return float(np.median(size[:, 1] / np.maximum(size[:, 2], 1e-300)))
+
+
+def thinned_lines(points: NDArray) -> NDArray[np.int64] | None:
+    """Rows of those of the points (n, 3) that are about as far apart along lines as across; None: there are no lines.
+
+    They are farthest points: the first so many as are even, with the most of them.
+    """
+    if len(points) < 4 * AROUND or evenness(points) > LINED:
+        return None
+    order = farthest_points_large(points, round(SHARES[0] * len(points)))
+    for share in SHARES:
+        kept = order[: max(round(share * len(points)), AROUND + 1)]
+        if evenness(points[kept]) > EVEN:
+            break
+    return np.sort(kept)
+
+
+def averaged(points: NDArray, rows: NDArray[np.int64]) -> NDArray:
+    """Points (m, 3) in place of those of the rows (m,): each the mean of all points (n, 3) that it is the nearest of."""
+    owner = cKDTree(points[rows]).query(points)[1]
+    total = np.stack([np.bincount(owner, axis, len(rows)) for axis in points.T], 1)
+    return total / np.bincount(owner, minlength=len(rows))[:, None]
