@@ -14,7 +14,20 @@ PACKAGE = Path(__file__).resolve().parents[1] / "pnu"
 
 # From the ground up. A file imports only from rooms before its own, and from its own.
 ROOMS = [
-    *("io", "config", "weights", "runtime", "geometry", "data", "networks", "losses", "metrics", "fast", "rendering"),
+    *(
+        "io",
+        "config",
+        "weights",
+        "runtime",
+        "geometry",
+        "data",
+        "networks",
+        "cleaning",
+        "losses",
+        "metrics",
+        "fast",
+        "rendering",
+    ),
     *("reconstruction", "upsamplers", "training", "benchmark", "report", "commands", "train", "__main__"),
 ]
 HEAVY = {"torch", "lightning", "hydra", "open3d", "tensorboard", "torchmetrics", "scipy", "h5py", "trimesh"}

@@ -35,6 +35,9 @@ class Upsample:
         "of text, or an array without names: x,y,z,_,r,g,b (_ is left out); null: by its names or the usual order"
     )
     sample: int | None = doc("of a mesh: as many points on its faces, with their normals; null: its vertices")
+    outliers: str = doc("auto: stray points, which lie off the surface, are taken out first; keep: all stay")
+    lines: str = doc("auto: scan lines, dense along and sparse across, are thinned out first; keep: they stay")
+    removed: str | None = doc("file for the points that were taken out; null: none is written")
     patch_size: int | None = doc("points of a patch, at least 16; null: what the network was made for")
     batch_size: int | None = doc("patches (surface: points) at once, bounds the memory; null: by the device")
     device: str = doc("auto, cpu, cuda, cuda:1 ...")
@@ -55,8 +58,11 @@ def upsample(cfg: Any) -> None:
     if not 1 <= cfg.ratio < float("inf"):  # here too: the network's libraries take seconds to load
         raise ValueError(f"ratio={cfg.ratio:g}: expected a number >= 1, the points out for each point in")
     io.check_output(cfg.output)
-    if Path(cfg.output).resolve() == Path(cfg.input).resolve():
-        raise ValueError(f"output={cfg.output}: is the input; give another name")
+    if cfg.removed is not None:
+        io.check_output(cfg.removed)
+    for name, path in (("output", cfg.output), ("removed", cfg.removed)):
+        if path is not None and Path(path).resolve() == Path(cfg.input).resolve():
+            raise ValueError(f"{name}={path}: is the input; give another name")
     if cfg.sample is None:
         cloud = io.read_cloud(cfg.input, normals=cfg.normals == "auto", columns=cfg.columns)
     else:
@@ -67,11 +73,21 @@ def upsample(cfg: Any) -> None:
         say(f"        {note}")
 
     from pnu import weights
+    from pnu.cleaning import clean_cloud
     from pnu.geometry.cloud_statistics import describe_cloud
     from pnu.networks import checkpoints
     from pnu.networks.checkpoints import NEWEST
     from pnu.upsamplers import whole_clouds
 
+    count, before = whole_clouds.output_count(len(cloud.points), cfg.ratio), cloud
+    cloud, stray = clean_cloud(cloud, outliers=cfg.outliers, lines=cfg.lines)
+    for note in cloud.notes[len(before.notes) :]:
+        say(f"        {note}")
+    if cfg.removed is not None:
+        io.write_cloud(
+            cfg.removed, before.points[stray], None, {name: v[stray] for name, v in before.attributes.items()}
+        )
+        say(f"        the points left out: {cfg.removed}")
     look = describe_cloud(cloud.points, cloud.normals)
     say(f"        {look}")
     for text in look.warnings():
@@ -89,7 +105,9 @@ def upsample(cfg: Any) -> None:
         dense = whole_clouds.upsample(
             cloud.points,
             cloud.normals,
-            ratio=cfg.ratio,
+            ratio=count / len(cloud.points),
+            outliers="keep",
+            lines="keep",
             model=checkpoints.load(run, cfg.allow) if cfg.allow else run,
             patch_size=cfg.patch_size,
             device=cfg.device,

@@ -68,7 +68,15 @@ class ProjectionDataModule(EpochDataModule):
             raise ValueError(f"data.root={self.root}: expected meshes to train on, found none but those of validation")
         self.truth = MeshScene(list(meshes.values()))
         self.check_batch_size(self.clouds, f"data.clouds={self.clouds}")
-        train = Crops(meshes, self.clouds, size=self.size, views=self.views, normals=self.normals, scans=self.scans, seed=self.seed)
+        train = Crops(
+            meshes,
+            self.clouds,
+            size=self.size,
+            views=self.views,
+            normals=self.normals,
+            scans=self.scans,
+            seed=self.seed,
+        )
         clouds = {
             part: WholeClouds(held_out, self.points, normals=self.normals, seed=seed)
             for part, seed in (("val", 1), ("test", 2))

@@ -4,14 +4,13 @@ Meshes are of the unit sphere (`pnu.data.shapes.unit`), faces outward. Rays are 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pnu.data.mesh_scene import ray_casting_scene
 from pnu.geometry.mesh_sampling import sample_area, sample_poisson_disk
-from pnu.geometry.sampling import farthest_points_large
 from pnu.io import Mesh
 
 STEEPEST = 0.3  # cosine of incidence below which noise along the ray grows no further
@@ -107,7 +106,11 @@ class Scanner:
         lump = of.noise * (0.5 * waves + 0.7 * rng.standard_normal(count))
         near = clean[rng.choice(count, round(of.near * count))]
         far = rng.uniform(-1.2, 1.2, (round(of.far * count), 3))
-        points = [clean[:, :3] + lump[:, None] * clean[:, 3:], near[:, :3] + 0.06 * rng.standard_normal((len(near), 3)), far]
+        points = [
+            clean[:, :3] + lump[:, None] * clean[:, 3:],
+            near[:, :3] + 0.06 * rng.standard_normal((len(near), 3)),
+            far,
+        ]
         lost = np.full((len(far), 6), np.nan)
         stray = np.repeat([False, True, True], [len(part) for part in points])
         return Scan(np.vstack(points), None, np.vstack([clean, near, lost]), np.full((len(stray), 3), np.nan), stray)
@@ -206,9 +209,8 @@ def any_scan(scanner: Scanner, rng: np.random.Generator) -> Scan:
     else:
         count, down = int(rng.integers(1, 6)), int(_log_uniform(rng, 16, 45))
         size = int(down * _log_uniform(rng, 3, 16)), down
-    camera = Camera(**{**camera.__dict__, "across": size[0], "down": size[1]})
-    found = scanner.views(distance * sphere_directions(max(count, 3), rng)[:count], camera, rng)
-    return found if kind == "lines" else found
+    camera = replace(camera, across=size[0], down=size[1])
+    return scanner.views(distance * sphere_directions(max(count, 3), rng)[:count], camera, rng)
 
 
 def sphere_directions(count: int, rng: np.random.Generator) -> np.ndarray:
@@ -238,7 +240,7 @@ def _cast(scene: Any, sensor: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray,
     import open3d
 
     origin = np.broadcast_to(sensor, rays.shape)
-    hits = scene.cast_rays(open3d.core.Tensor(np.hstack([origin, rays]).astype(np.float32)), nthreads=1)
+    hits = scene.cast_rays(open3d.core.Tensor.from_numpy(np.hstack([origin, rays]).astype(np.float32)), nthreads=1)
     depth, normals = hits["t_hit"].numpy().astype(float), hits["primitive_normals"].numpy().astype(float)
     return depth, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 

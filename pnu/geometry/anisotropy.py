@@ -26,9 +26,9 @@ def evenness(points: NDArray) -> float:
 
 
 def thinned_lines(points: NDArray) -> NDArray[np.int64] | None:
-    """Rows of those of the points (n, 3) that are about as far apart along lines as across; None: there are no lines.
+    """Rows of those of the points (n, 3) that lie evenly enough for neighborhoods to span lines; None: no lines.
 
-    They are farthest points: the first so many as are even, with the most of them.
+    They are farthest points, as many as can be: thinner than that, the surface between is worse known.
     """
     if len(points) < 4 * AROUND or evenness(points) > LINED:
         return None

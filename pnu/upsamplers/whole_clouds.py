@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from pnu import __version__
+from pnu.cleaning import Treatment, clean_cloud
 from pnu.fast import accelerated
 from pnu.geometry.attributes import carry
 from pnu.geometry.normal_estimation import complete_normals, estimate_normals
@@ -39,6 +40,8 @@ def upsample(
     ratio: float = 4,
     model: nn.Module | Upsampler | str | PathLike[str] = "surface",
     patch_size: int | None = None,
+    outliers: Treatment = "auto",
+    lines: Treatment = "auto",
     device: str = "auto",
     devices: int = 1,
     batch_size: int | None = None,
@@ -61,6 +64,8 @@ def upsample(
             the run that finished last under outputs/, or an upsampler: "apss", "poisson", "midpoint", or one's own.
             "surface" takes the weights made for estimated normals where none are given.
         patch_size: points of a patch, at least 16; None: what the network was made for. "surface" has no patches.
+        outliers: "auto": stray points are taken out first, and not counted less for it: n stays; "keep": none is.
+        lines: "auto": scan lines, dense along and sparse across, are thinned out first; "keep": they stay.
         device: "auto" (where the given network is; else CUDA where there is one), "cpu", "cuda", "cuda:1" ...
         devices: CUDA devices, or processes on the CPU, that share the work of the network; the result is the same for
             any number. More than one needs `if __name__ == "__main__":` in a script.
@@ -89,6 +94,7 @@ def upsample(
     for name, value, least in sizes:
         if value is not None and not (isinstance(value, Integral) and value >= least):
             raise ValueError(f"{name}={value}: expected a whole number >= {least}")
+    given = clean_cloud(given, outliers=outliers, lines=lines).cloud
     network, target = _on_device(*_model(model, given.normals), device)
     upsampler = upsampler_of(network, patch_size)
     if devices > 1 and not getattr(upsampler, "parallel", False):

@@ -1,0 +1,57 @@
+"""What is done to a cloud before it becomes denser: stray points taken out, scan lines evened out. And said."""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnu.cleaning.outliers import stray_points
+from pnu.geometry.anisotropy import averaged, thinned_lines
+from pnu.io import Cloud
+from pnu.io.cloud import chosen
+
+Treatment = Literal["auto", "keep"]
+TREATMENTS = ("auto", "keep")
+
+__all__ = ["TREATMENTS", "Cleaned", "Treatment", "clean_cloud", "stray_points"]
+
+
+class Cleaned(NamedTuple):
+    """A cloud after the treatments, and what became of the points of the one before."""
+
+    cloud: Cloud  # its notes say what was done
+    stray: NDArray[np.int64]  # rows of the cloud before that were taken out as stray
+
+
+def clean_cloud(cloud: Cloud, *, outliers: Treatment = "auto", lines: Treatment = "auto") -> Cleaned:
+    """A cloud without its stray points (`outliers`), and with its scan lines thinned out (`lines`).
+
+    Lines are found where points are several times as dense along one direction as across it. As many points stay as lie
+    about as far apart along lines as across; each moves to the mean of the points that it stands for, which takes most
+    of the noise from them. Lines with normals stay as they are: then nothing is to be estimated from neighbors.
+
+    Args:
+        cloud: as `pnu.io.check_cloud` gives it.
+        outliers: auto: stray points are taken out; keep: all stay.
+        lines: auto: thinned out; keep: as they are.
+
+    Raises:
+        ValueError: a treatment is neither auto nor keep, or hardly a point is none of the stray ones.
+    """
+    for name, value in (("outliers", outliers), ("lines", lines)):
+        if value not in TREATMENTS:
+            raise ValueError(f"{name}={value}: expected auto or keep")
+    stray = np.flatnonzero(stray_points(cloud.points)) if outliers == "auto" else np.empty(0, np.int64)
+    notes = list(cloud.notes)
+    if len(stray):
+        notes.append(
+            f"{len(stray)} of {len(cloud.points)} points left out: stray, they lie off the surface (outliers=keep)"
+        )
+        cloud = chosen(cloud, np.setdiff1d(np.arange(len(cloud.points)), stray))
+    rows = thinned_lines(cloud.points) if lines == "auto" and cloud.normals is None else None
+    if rows is not None:
+        notes.append(
+            f"lies in lines: {len(rows)} points, less dense along them, stand for {len(cloud.points)} (lines=keep)"
+        )
+        cloud = chosen(cloud, rows)._replace(points=averaged(cloud.points, rows))
+    return Cleaned(cloud._replace(notes=tuple(notes)), stray)

@@ -1,0 +1,65 @@
+"""Stray points: those that measure nothing, found by a small trained network and taken out."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from pnu.geometry.outlier_features import outlier_features
+from pnu.networks.outlier_detector import OutlierDetector
+
+WEIGHTS = Path(__file__).with_name("outliers.safetensors")
+SURE = 2.0  # logarithm of the odds from which on a point is taken for stray
+ROUNDS = 3  # a stray point hides another
+PIECE = 12  # points below which a piece that stands apart is stray
+APART = 6.0  # usual spacings between a piece and all others
+FEWEST = 64  # points of a cloud in which strays can be told
+
+
+@cache
+def detector() -> OutlierDetector:
+    """The network that comes with pnu."""
+    from safetensors.torch import load_file
+
+    network = OutlierDetector()
+    network.load_state_dict(load_file(WEIGHTS))
+    return network.eval()
+
+
+def stray_points(points: NDArray[np.float64], *, sure: float = SURE) -> NDArray[np.bool_]:
+    """Which of the points (n, 3) are stray, (n,): by the detector, then pieces of a few points that stand apart.
+
+    Rows may be in any order; place, rotation and size have no influence. Clouds of fewer than 64 points have none.
+    """
+    stays = np.ones(len(points), bool)
+    for _ in range(ROUNDS):
+        rows = np.flatnonzero(stays)
+        if len(rows) < FEWEST:
+            break
+        with torch.inference_mode():
+            odds = detector()(torch.from_numpy(outlier_features(points[rows]))).numpy()
+        stray = odds > sure
+        stays[rows[stray]] = False
+        if not stray.any():
+            break
+    rows = np.flatnonzero(stays)
+    if len(rows) >= FEWEST:
+        stays[rows[small_pieces(points[rows])]] = False
+    return ~stays
+
+
+def small_pieces(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which of the points (n, 3) belong to a piece of fewer than 12 that stands apart from all others, (n,)."""
+    k = min(PIECE, len(points) - 1)
+    distance, near = (found[:, 1:] for found in cKDTree(points).query(points, k + 1))
+    reach = APART * np.median(distance[near, min(5, k - 1)], 1)
+    linked = distance <= np.maximum(reach[:, None], reach[near])
+    first = np.broadcast_to(np.arange(len(points))[:, None], near.shape)[linked]
+    graph = coo_matrix((np.ones(len(first), bool), (first, near[linked])), (len(points), len(points)))
+    piece = connected_components(graph, directed=False)[1]
+    return (np.bincount(piece) < PIECE)[piece]

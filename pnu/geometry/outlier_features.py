@@ -1,0 +1,84 @@
+"""What tells a stray point from a measured one: how a point lies among its 32 nearest neighbors, in numbers.
+
+The ingredients are those of the usual removers of outliers, side by side: distances to neighbors against those around
+(statistical outlier removal), how often others have the point for a neighbor, heights over fitted planes, and local
+outlier factors (Breunig et al. 2000). All are free of place, rotation, size and density.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+NEIGHBORS = 32
+RANKS = np.array([1, 2, 3, 4, 6, 8, 12, 16, 24, 32])  # whose distances are told
+AROUND = 24  # neighbors whose usual spacing is the unit of length
+PLANES = (8, 16, 32)  # neighbors that planes are fitted to; the second gives the normals
+FELLOWS = (8, 24)  # neighbors whose planes the point is held against
+LISTS = (6, 12, 20, 32)  # lengths of the lists of nearest points in which a point is looked for
+REACHES = (8, 20)  # neighbors of the local outlier factors
+LIMIT = 6.0  # of all features
+FEATURES = 52
+ROWS = 2**16  # points at once: bounds the memory
+
+
+def outlier_features(points: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Features (n, 52) of points (n, 3), n >= 3. Fewer than 33 points have their farthest neighbor several times."""
+    k = min(NEIGHBORS, len(points) - 1)
+    distance, near = (found[:, 1:] for found in cKDTree(points).query(points, k + 1))
+    if k < NEIGHBORS:
+        distance, near = (np.pad(found, ((0, 0), (0, NEIGHBORS - k)), mode="edge") for found in (distance, near))
+    distance = np.maximum(distance, 1e-300)
+    spacing = distance[:, 5]
+    unit = np.median(spacing[near[:, :AROUND]], 1)
+    parts = [slice(first, first + ROWS) for first in range(0, len(points), ROWS)]
+    planes = [
+        np.concatenate(found) for found in zip(*(_planes(points, near[p], unit[p], p) for p in parts), strict=True)
+    ]
+    normals = planes[1]
+    columns = [
+        np.log(distance[:, RANKS - 1] / unit[:, None]),
+        np.log(np.quantile(spacing[near], (0.1, 0.25, 0.75, 0.9), axis=1).T / unit[:, None]),
+        *((np.bincount(near[:, :m].ravel(), minlength=len(points)) / m)[:, None] for m in LISTS),
+        planes[0],
+        np.concatenate([_among_fellows(points, normals, near[p], unit[p], p) for p in parts]),
+        *(_outlier_factors(distance, near, m) for m in REACHES),
+    ]
+    return np.clip(np.nan_to_num(np.hstack(columns)), -LIMIT, LIMIT).astype(np.float32)
+
+
+def _planes(points: NDArray, near: NDArray, unit: NDArray, part: slice) -> tuple[NDArray, NDArray]:
+    """Of planes fitted to neighbors: the point's height over each, its way to their middle, their sizes; a normal."""
+    found, normals = [], near
+    for m in PLANES:
+        neighbors = points[near[:, :m]]
+        middle = neighbors.mean(1)
+        centered = neighbors - middle[:, None]
+        variance, axes = np.linalg.eigh(centered.transpose(0, 2, 1) @ centered / m)
+        offset, size = points[part] - middle, np.sqrt(np.maximum(variance, 0))
+        height = np.abs((offset * axes[:, :, 0]).sum(1))
+        lengths = np.column_stack([height, np.linalg.norm(offset, axis=1)]) / unit[:, None]
+        sizes = np.log(size / unit[:, None] + 1e-3)
+        found.append(np.column_stack([lengths, sizes, height / (size[:, 0] + 0.05 * unit)]))
+        if m == PLANES[1]:
+            normals = axes[:, :, 0]
+    return np.hstack(found), normals
+
+
+def _among_fellows(points: NDArray, normals: NDArray, near: NDArray, unit: NDArray, part: slice) -> NDArray:
+    """The point's heights over its neighbors' planes, and how alike their normals are."""
+    found = []
+    for m in FELLOWS:
+        fellows = near[:, :m]
+        planes = normals[fellows]
+        height = np.abs(((points[part, None] - points[fellows]) * planes).sum(2)) / unit[:, None]
+        alike = np.abs((planes * normals[part, None]).sum(2)).mean(1)
+        shares = np.linalg.eigvalsh(planes.transpose(0, 2, 1) @ planes / m)[:, :0:-1]
+        found.append(np.column_stack([np.median(height, 1), np.quantile(height, 0.25, axis=1), alike, shares]))
+    return np.hstack(found)
+
+
+def _outlier_factors(distance: NDArray, near: NDArray, m: int) -> NDArray:
+    """Logarithm of the local outlier factor with m neighbors, and its usual and high values around."""
+    reach = np.maximum(distance[:, :m], distance[near[:, :m], m - 1]).mean(1)
+    factor = np.log(reach * (1 / reach)[near[:, :m]].mean(1))
+    return np.column_stack([factor, np.quantile(factor[near[:, :m]], (0.5, 0.9), axis=1).T])

@@ -1,0 +1,25 @@
+"""The network that finds stray points, from how each lies among its neighbors (`pnu.geometry.outlier_features`)."""
+
+import torch
+from torch import Tensor, nn
+
+from pnu.geometry.outlier_features import FEATURES
+
+
+class OutlierDetector(nn.Module):
+    """Features of points (n, 52) -> logarithm of the odds that each is stray, (n,)."""
+
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(self, width: int = 64) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(FEATURES))
+        self.register_buffer("deviation", torch.ones(FEATURES))
+        self.layers = nn.Sequential(
+            nn.Linear(FEATURES, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1)
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        odds: Tensor = self.layers((features - self.mean) / self.deviation)
+        return odds[:, 0]

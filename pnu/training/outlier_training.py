@@ -1,0 +1,121 @@
+"""Train the network that finds stray points: `python -m pnu.training.outlier_training MESHES FILE.safetensors`.
+
+On simulated scans, on clean and noisy clouds, and on those with points strewn around them, of the procedural shapes and
+the meshes of a folder. Minutes on one core; the same seed gives the same weights.
+"""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits
+
+from pnu.data import shapes
+from pnu.data.crops import Crops
+from pnu.data.mesh_scene import MeshScene
+from pnu.data.scanner import KINDS, Scanner, any_scan
+from pnu.geometry.outlier_features import outlier_features
+from pnu.io import Mesh, atomic_path, meshes_of, read_mesh
+from pnu.networks.outlier_detector import OutlierDetector
+from pnu.runtime.progress import counted
+
+STRAY = 0.015  # distance from the surface, in radii, beyond which a point is one,
+NOISES = 3.0  # if it is that many times what two thirds of the points stay below
+ALONE = 8.0  # most that a good point counts for: by the area it stands for, as a hole is worst where points are few
+STRAYS, OTHERS = 512, 1536  # points of a step
+
+
+class Examples(NamedTuple):
+    """Points to learn from."""
+
+    features: Tensor  # (n, 52)
+    stray: Tensor  # (n,) 0 or 1
+    weight: Tensor  # (n,)
+
+
+def clouds(mesh: Mesh, scanner: Scanner, rng: np.random.Generator) -> Iterator[np.ndarray]:
+    """Clouds (n, 3) of a mesh, with strays and without."""
+    for scan in KINDS.values():
+        yield scan(scanner, rng).points
+    for _ in range(3):
+        yield any_scan(scanner, rng).points
+    plain = Crops({"": mesh}, 1, normals="estimated")
+    for strewn in (False, True):
+        _, noisy = plain.cloud(mesh, rng)
+        points = noisy[:, :3]
+        if strewn:
+            count = rng.integers(1, max(2, len(points) // 20))
+            places = points[rng.integers(len(points), size=count)]
+            clump = places + rng.uniform(0.05, 0.5) * rng.standard_normal(3) + 0.02 * rng.standard_normal((count, 3))
+            cloudy = places + rng.uniform(0.03, 0.3) * rng.standard_normal((count, 3))
+            points = np.vstack([points, clump[: rng.integers(0, 12)], cloudy])
+        yield points
+
+
+def examples_of(meshes: Sequence[Mesh], seed: int) -> Examples:
+    """Labelled points of the clouds of meshes in the unit sphere."""
+    truth = MeshScene(meshes)
+    found: list[tuple[Tensor, ...]] = []
+    for index in counted(range(len(meshes)), len(meshes), "scans"):
+        rng = np.random.default_rng((seed, index))
+        for points in clouds(meshes[index], Scanner(meshes[index]), rng):
+            if len(points) < 64:
+                continue
+            there = torch.from_numpy(points)[None]
+            distance = (there - truth.closest(there, torch.tensor([index]))[0])[0].norm(dim=1)
+            features = torch.from_numpy(outlier_features(points))
+            stray = distance > max(STRAY, NOISES * distance.quantile(0.68).item())
+            area = (2 * features[:, 4]).exp().clamp(1, ALONE)  # by the sixth neighbor's distance
+            found.append((features, stray.float(), torch.where(stray, 1.0, area)))
+    return Examples(*(torch.cat(parts) for parts in zip(*found, strict=True)))
+
+
+def train(examples: Examples, *, steps: int = 4000, lr: float = 4e-3, seed: int = 0) -> OutlierDetector:
+    """A detector trained on examples, as many strays in each step as there are good points to three."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = OutlierDetector()
+    network.mean.copy_(examples.features.mean(0))
+    network.deviation.copy_(examples.features.std(0).clamp_min(1e-6))
+    optimizer = torch.optim.AdamW(network.parameters(), lr, weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, lr, total_steps=steps)
+    groups = [(examples.stray == value).nonzero()[:, 0] for value in (1, 0)]
+    for _ in counted(range(steps), steps, "training"):
+        rows = torch.cat([
+            group[torch.randint(len(group), (size,), generator=generator)]
+            for group, size in zip(groups, (STRAYS, OTHERS), strict=True)
+        ])  # fmt: skip
+        odds = network(examples.features[rows])
+        loss = binary_cross_entropy_with_logits(odds, examples.stray[rows], examples.weight[rows])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    return network.eval()
+
+
+def main() -> None:
+    """The command line."""
+    from safetensors.torch import save
+
+    parser = argparse.ArgumentParser(prog="python -m pnu.training.outlier_training", description=__doc__)
+    parser.add_argument("meshes", type=Path, help="folder of closed meshes, beside the procedural shapes")
+    parser.add_argument("output", type=Path, help="file of weights to write")
+    parser.add_argument("--leave", nargs="*", default=[], help="names of meshes that are not trained on")
+    parser.add_argument("--seed", type=int, default=0, help="of all that is drawn")
+    arguments = parser.parse_args()
+    meshes = {name: shapes.unit(read_mesh(path)) for name, path in meshes_of(arguments.meshes).items()}
+    meshes |= {name: shapes.make(name) for name in shapes.names()}
+    chosen = [mesh for name, mesh in meshes.items() if name not in arguments.leave]
+    network = train(examples_of(chosen, arguments.seed), seed=arguments.seed)
+    with atomic_path(arguments.output) as temporary:
+        temporary.write_bytes(save({name: value.contiguous() for name, value in network.state_dict().items()}))
+
+
+if __name__ == "__main__":
+    main()

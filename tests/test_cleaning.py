@@ -1,0 +1,155 @@
+"""Cleaning: stray points are found and taken out, scan lines are evened out, and it is said."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+import pnu
+from pnu.cleaning import clean_cloud
+from pnu.cleaning.outliers import small_pieces, stray_points
+from pnu.commands.upsample import main
+from pnu.data import shapes
+from pnu.data.scanner import KINDS, Scanner
+from pnu.geometry.anisotropy import averaged, evenness, thinned_lines
+from pnu.geometry.mesh_sampling import sample_area
+from pnu.geometry.outlier_features import FEATURES, NEIGHBORS, outlier_features
+from pnu.io import Cloud, read_cloud
+
+
+def sphere(n: int, seed: int = 0) -> np.ndarray:
+    points = np.random.default_rng(seed).standard_normal((n, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def with_strays(n: int = 2000, strays: int = 40) -> np.ndarray:
+    """A unit sphere, then points inside it and around it, at least a tenth off."""
+    rng = np.random.default_rng(1)
+    radius = np.where(rng.random(strays) < 0.5, rng.uniform(0.2, 0.85, strays), rng.uniform(1.15, 2, strays))
+    return np.vstack([sphere(n), radius[:, None] * sphere(strays, 2)])
+
+
+def test_strays_of_a_sphere_are_found_and_nothing_else() -> None:
+    stray = stray_points(with_strays())
+    assert stray[2000:].mean() > 0.95
+    assert stray[:2000].mean() < 0.005
+
+
+@pytest.mark.parametrize("name", shapes.names()[::9])
+def test_clean_clouds_lose_nothing_to_speak_of(name: str) -> None:
+    points = sample_area(shapes.make(name), 3000, np.random.default_rng(0))[:, :3]
+    assert stray_points(points).sum() <= 6
+
+
+def test_order_place_rotation_and_size_have_no_influence() -> None:
+    points = with_strays()
+    stray = stray_points(points)
+    order = np.random.default_rng(0).permutation(len(points))
+    assert (stray_points(points[order]) == stray[order]).all()
+    turn = Rotation.random(rng=np.random.default_rng(1)).as_matrix()
+    for moved in (1e6 * points, 1e-6 * points, points @ turn.T, points + [1000, 0, 0]):
+        assert (stray_points(moved) != stray).mean() < 0.001
+
+
+def test_one_point_a_million_away() -> None:
+    points = np.vstack([sphere(500), [[1e6, 0, 0]]])
+    assert stray_points(points).nonzero()[0].tolist() == [500]
+
+
+def test_pieces_of_a_few_points_that_stand_apart() -> None:
+    clump = [3, 0, 0] + 0.05 * sphere(8, 3)
+    points = np.vstack([sphere(1000), clump])
+    assert small_pieces(points).nonzero()[0].tolist() == list(range(1000, 1008))
+    assert not small_pieces(np.vstack([sphere(1000), [3, 0, 0] + sphere(1000)])).any()
+
+
+def test_local_outlier_factor_by_its_definition() -> None:
+    points = with_strays(60, 4)
+    apart = np.linalg.norm(points[:, None] - points[None], axis=2)
+    near = np.argsort(apart, axis=1)[:, 1:9]  # 8 neighbors
+    far = np.take_along_axis(apart, near[:, -1:], 1)[:, 0]
+    reach = np.maximum(np.take_along_axis(apart, near, 1), far[near]).mean(1)
+    factor = np.log(reach * np.array([(1 / reach[list(rows)]).mean() for rows in near]))
+    found = outlier_features(points)
+    assert found.shape == (64, FEATURES)
+    np.testing.assert_allclose(found[:, -6], factor, atol=1e-5)
+
+
+def test_features_of_fewer_points_than_neighbors() -> None:
+    found = outlier_features(sphere(NEIGHBORS // 2))
+    assert found.shape == (NEIGHBORS // 2, FEATURES)
+    assert np.isfinite(found).all()
+
+
+def lines(across: int = 24, along: int = 240, noise: float = 0.0) -> np.ndarray:
+    u, v = np.meshgrid(np.linspace(0, 1, along), np.linspace(0, 1, across))
+    return np.stack([u.ravel(), v.ravel(), noise * np.random.default_rng(0).standard_normal(u.size)], 1)
+
+
+def test_lines_are_thinned_to_their_distance() -> None:
+    points = lines()
+    assert evenness(points) < 0.2 < 0.5 < evenness(sphere(2000))
+    rows = thinned_lines(points)
+    assert rows is not None
+    assert evenness(points[rows]) > 0.5
+    nearest = cKDTree(points[rows]).query(points[rows], 2)[0][:, 1]
+    assert np.median(nearest) > 1.9 / 239  # along the lines; before: 1/239
+    assert thinned_lines(sphere(2000)) is None
+
+
+def test_the_mean_of_a_line_s_points_has_less_noise() -> None:
+    points = lines(noise=0.002)
+    rows = thinned_lines(points)
+    assert rows is not None
+    assert averaged(points, rows)[:, 2].std() < 0.8 * points[rows, 2].std()
+
+
+def test_clean_cloud_says_what_it_did_and_keeps_what_it_is_told_to() -> None:
+    points = with_strays()
+    cloud = Cloud(points, None, {"row": np.arange(len(points))})
+    cleaned = clean_cloud(cloud)
+    assert set(cleaned.stray) | set(cleaned.cloud.attributes["row"]) == set(range(len(points)))
+    assert f"{len(cleaned.stray)} of 2040 points left out: stray" in cleaned.cloud.notes[-1]
+    kept = clean_cloud(cloud, outliers="keep", lines="keep")
+    assert (kept.cloud.points == points).all()
+    assert not len(kept.stray)
+    with pytest.raises(ValueError, match="outliers=away: expected auto or keep"):
+        clean_cloud(cloud, outliers="away")  # type: ignore[arg-type]
+
+
+def test_strays_do_not_multiply() -> None:
+    points = with_strays(1000, 20)
+    dense = pnu.upsample(points, ratio=4)
+    assert dense.shape == (4080, 6)
+    assert np.abs(np.linalg.norm(dense[:, :3], axis=1) - 1).max() < 0.05
+    kept = pnu.upsample(points, ratio=4, outliers="keep")
+    assert (np.abs(np.linalg.norm(kept[:, :3], axis=1) - 1) > 0.05).sum() > 20
+
+
+def test_the_command_says_it_and_writes_what_it_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.savetxt("cloud.xyz", with_strays(1000, 20))
+    main(["input=cloud.xyz", "output=dense.ply", "removed=removed.ply"])
+    said = capsys.readouterr().out
+    removed = read_cloud(tmp_path / "removed.ply", minimum=1).points
+    assert f"{len(removed)} of 1020 points left out: stray" in said
+    assert "removed.ply" in said
+    assert (np.abs(np.linalg.norm(removed, axis=1) - 1) > 0.1).mean() > 0.9
+    assert len(read_cloud(tmp_path / "dense.ply").points) == 4080
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_scans_have_the_truth_beside_them(kind: str) -> None:
+    scanner = Scanner(shapes.make(shapes.names()[0]))
+    scan, again = (KINDS[kind](scanner, np.random.default_rng(3)) for _ in range(2))
+    assert (scan.points == again.points).all()
+    assert len(scan.points) == len(scan.clean) == len(scan.sensor) == len(scan.stray) > 500
+    off = np.linalg.norm(scan.points - scan.clean[:, :3], axis=1)[~scan.stray]
+    assert 0.0005 < np.median(off) < 0.01
+    if kind in ("orbit", "oneview", "lines"):
+        toward = scan.sensor - scan.clean[:, :3]
+        assert ((toward * scan.clean[:, 3:]).sum(1) > 0).all()  # a sensor sees the side that faces it
