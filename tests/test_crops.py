@@ -87,7 +87,7 @@ def test_some_crops_are_noisy_and_some_are_turned_inside_out(meshes: dict[str, M
 
 
 def test_unknown_kind_of_normals_is_refused(meshes: dict[str, Mesh]) -> None:
-    with pytest.raises(ValueError, match=r"data\.normals=guessed: expected given or estimated"):
+    with pytest.raises(ValueError, match=r"data\.normals=guessed: expected given, estimated or mixed"):
         Crops(meshes, 1, normals="guessed")
 
 

@@ -318,9 +318,7 @@ def test_training_seeds_are_spread_and_pushed_outward() -> None:
 def test_more_seeds_than_a_crop_can_bear_are_refused() -> None:
     patch = sphere(16).float()[None]
     assert Surface(queries=48).outputs(patch)["prediction"].shape == (1, 48, 6)
-    with pytest.raises(
-        ValueError, match=r"model\.queries=49: expected at most 3 times .* found 16 points; raise data.size"
-    ):
+    with pytest.raises(ValueError, match=r"model\.queries=49: expected at most 3 times .* points=16"):
         Surface(queries=49).outputs(patch)
 
 

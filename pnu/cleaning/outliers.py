@@ -62,4 +62,5 @@ def small_pieces(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     first = np.broadcast_to(np.arange(len(points))[:, None], near.shape)[linked]
     graph = coo_matrix((np.ones(len(first), bool), (first, near[linked])), (len(points), len(points)))
     piece = connected_components(graph, directed=False)[1]
-    return (np.bincount(piece) < PIECE)[piece]
+    small: NDArray[np.bool_] = (np.bincount(piece) < PIECE)[piece]
+    return small

@@ -34,8 +34,9 @@ class ProjectionDataModule(EpochDataModule):
 
     def __init__(
         self, root: str | None = None, procedural: bool = True, validation: Iterable[str] = (),
-        normals: Literal["given", "estimated", "mixed"] = "given", scans: float = 0.0, clouds: int = 6400, size: int = 384, views: int = 2,
-        batch_size: int = 8, points: int = 2048, workers: int = 0, seed: int = 0,
+        normals: Literal["given", "estimated", "mixed"] = "given", scans: float = 0.0,
+        clouds: int = 6400, size: int = 384, views: int = 2, batch_size: int = 8, points: int = 2048,
+        workers: int = 0, seed: int = 0,
     ) -> None:  # fmt: skip
         super().__init__(batch_size, workers, seed)
         if points < SMALLEST:

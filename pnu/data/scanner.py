@@ -231,8 +231,8 @@ def _rays(sensor: np.ndarray, camera: Camera) -> np.ndarray:
     right = np.cross(ahead, UP if abs(ahead[2]) < 0.9 else UP[[2, 1, 0]])
     right /= np.linalg.norm(right)
     u, v = np.meshgrid(*(np.linspace(-camera.half, camera.half, count) for count in (camera.across, camera.down)))
-    rays = u[..., None] * right + v[..., None] * np.cross(ahead, right) + ahead
-    return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).reshape(-1, 3)
+    rays: np.ndarray = u[..., None] * right + v[..., None] * np.cross(ahead, right) + ahead
+    return rays.reshape(-1, 3) / np.linalg.norm(rays, axis=-1).reshape(-1, 1)
 
 
 def _cast(scene: Any, sensor: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -248,7 +248,8 @@ def _cast(scene: Any, sensor: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray,
 def _beside_a_gap(hit: np.ndarray) -> np.ndarray:
     """Which pixels (h, w) have one of their four neighbors empty or outside the picture."""
     padded = np.pad(hit, 1)
-    return ~(padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:])
+    inner: np.ndarray = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
+    return ~inner
 
 
 def _rotation(rng: np.random.Generator, degrees: float) -> np.ndarray:
@@ -257,7 +258,8 @@ def _rotation(rng: np.random.Generator, degrees: float) -> np.ndarray:
     x, y, z = axis / np.linalg.norm(axis)
     angle = np.radians(degrees * rng.standard_normal())
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    rotation: np.ndarray = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return rotation
 
 
 def _together(scans: Sequence[Scan]) -> Scan:

@@ -13,7 +13,7 @@ EVEN = 0.5
 SHARES = tuple(2 ** (-i / 4) for i in range(2, 21))  # of the points, that may be kept: 0.7 to 0.03
 
 
-def evenness(points: NDArray) -> float:
+def evenness(points: NDArray[np.float64]) -> float:
     """Spread of the nearest neighbors across, over along their main direction, at the median of 2000 places.
 
     About 0.6 for the points (n, 3) of a surface, drawn at random or evenly; 0.1 and less on lines.
@@ -25,7 +25,7 @@ def evenness(points: NDArray) -> float:
     return float(np.median(size[:, 1] / np.maximum(size[:, 2], 1e-300)))
 
 
-def thinned_lines(points: NDArray) -> NDArray[np.int64] | None:
+def thinned_lines(points: NDArray[np.float64]) -> NDArray[np.int64] | None:
     """Rows of those of the points (n, 3) that lie evenly enough for neighborhoods to span lines; None: no lines.
 
     They are farthest points, as many as can be: thinner than that, the surface between is worse known.
@@ -40,8 +40,8 @@ def thinned_lines(points: NDArray) -> NDArray[np.int64] | None:
     return np.sort(kept)
 
 
-def averaged(points: NDArray, rows: NDArray[np.int64]) -> NDArray:
-    """Points (m, 3) in place of those of the rows (m,): each the mean of all points (n, 3) that it is the nearest of."""
+def averaged(points: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Points (m, 3) in place of those of the rows (m,): each the mean of all points (n, 3) that are nearest to it."""
     owner = cKDTree(points[rows]).query(points)[1]
     total = np.stack([np.bincount(owner, axis, len(rows)) for axis in points.T], 1)
     return total / np.bincount(owner, minlength=len(rows))[:, None]

@@ -19,6 +19,8 @@ REACHES = (8, 20)  # neighbors of the local outlier factors
 LIMIT = 6.0  # of all features
 FEATURES = 52
 ROWS = 2**16  # points at once: bounds the memory
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 
 def outlier_features(points: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -43,12 +45,13 @@ def outlier_features(points: NDArray[np.float64]) -> NDArray[np.float32]:
         np.concatenate([_among_fellows(points, normals, near[p], unit[p], p) for p in parts]),
         *(_outlier_factors(distance, near, m) for m in REACHES),
     ]
-    return np.clip(np.nan_to_num(np.hstack(columns)), -LIMIT, LIMIT).astype(np.float32)
+    features: NDArray[np.float32] = np.clip(np.nan_to_num(np.hstack(columns)), -LIMIT, LIMIT).astype(np.float32)
+    return features
 
 
-def _planes(points: NDArray, near: NDArray, unit: NDArray, part: slice) -> tuple[NDArray, NDArray]:
+def _planes(points: Floats, near: Indices, unit: Floats, part: slice) -> tuple[Floats, Floats]:
     """Of planes fitted to neighbors: the point's height over each, its way to their middle, their sizes; a normal."""
-    found, normals = [], near
+    found, normals = [], np.empty(0)
     for m in PLANES:
         neighbors = points[near[:, :m]]
         middle = neighbors.mean(1)
@@ -64,7 +67,7 @@ def _planes(points: NDArray, near: NDArray, unit: NDArray, part: slice) -> tuple
     return np.hstack(found), normals
 
 
-def _among_fellows(points: NDArray, normals: NDArray, near: NDArray, unit: NDArray, part: slice) -> NDArray:
+def _among_fellows(points: Floats, normals: Floats, near: Indices, unit: Floats, part: slice) -> Floats:
     """The point's heights over its neighbors' planes, and how alike their normals are."""
     found = []
     for m in FELLOWS:
@@ -77,7 +80,7 @@ def _among_fellows(points: NDArray, normals: NDArray, near: NDArray, unit: NDArr
     return np.hstack(found)
 
 
-def _outlier_factors(distance: NDArray, near: NDArray, m: int) -> NDArray:
+def _outlier_factors(distance: Floats, near: Indices, m: int) -> Floats:
     """Logarithm of the local outlier factor with m neighbors, and its usual and high values around."""
     reach = np.maximum(distance[:, :m], distance[near[:, :m], m - 1]).mean(1)
     factor = np.log(reach * (1 / reach)[near[:, :m]].mean(1))
