@@ -77,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(f"pnu {__version__}")
     elif verb == "--completion" and rest in (["bash"], ["zsh"]):
         print(completion(rest[0]))
-    elif verb in verbs():
+    elif verb in {path.stem for path in COMMANDS.glob("[a-z]*.py")}:
         sys.argv = [sys.argv[0], *rest]
         runpy.run_module(f"pnu.commands.{verb}", run_name="__main__", alter_sys=True)
     else:

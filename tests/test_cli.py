@@ -67,7 +67,7 @@ HEAVY = {"torch", "lightning", "open3d", "tensorboard", "torchmetrics", "scipy",
 @pytest.mark.parametrize("arguments", [["--help"], ["loss.w9=1"], ["-m", "loss.w9=0,1"], ["model=foo"]])
 def test_help_and_mistakes_are_answered_before_anything_heavy(arguments: list[str]) -> None:
     loaded = loaded_by(*arguments)
-    assert "hydra" in loaded
+    assert "omegaconf" in loaded
     assert not loaded & HEAVY
 
 

@@ -172,5 +172,14 @@ def test_the_public_functions_are_listed_before_their_first_use() -> None:
     assert {"load", "normals", "upsample"} <= loaded_by("import pnu; print(*dir(pnu))")
 
 
+def test_only_pictures_and_reports_load_matplotlib(tmp_path: Path) -> None:
+    (tmp_path / "cloud.xyz").write_text("\n".join(f"{x} {y} {x * y / 9}" for x in range(8) for y in range(8)))
+    assert "matplotlib" not in loaded_by("import pnu, numpy; pnu.upsample(numpy.random.rand(64, 3))")
+    keys = [f"input={tmp_path}/cloud.xyz", f"output={tmp_path}/dense.ply", "quiet=true"]
+    assert "matplotlib" not in loaded_by(f"from pnu.__main__ import main; main(['upsample', *{keys}])")
+    assert (tmp_path / "dense.ply").is_file()
+    assert "matplotlib" in loaded_by("from pnu.report import plots; plots.plot('', [print])")
+
+
 def test_heavy_import_would_be_seen() -> None:
     assert "torch" in loaded_by("import pnu; import pnu.geometry.neighbor_search") & HEAVY

@@ -13,8 +13,8 @@ import yaml
 from omegaconf import OmegaConf
 
 from pnu.commands.train import Train
-from pnu.config.compose import compose_config, config_folder
-from pnu.config.help_text import help_text, reference
+from pnu.config.compose import compose_config, composer, config_folder
+from pnu.config.help_text import help_text, reference, written
 from pnu.config.schema import class_arguments, convert, library, settable, targets, type_name
 from pnu.config.signature import REQUIRED, Class, arguments, described, summary
 
@@ -261,20 +261,37 @@ def test_help_says_the_words_of_the_constructors() -> None:
     assert "log_every_n_steps" not in text  # not for the user to choose
 
 
-@pytest.mark.parametrize("verb", ["train", "prepare", "evaluate", "compare"])
+@pytest.mark.parametrize("verb", ["train", "prepare", "evaluate", "compare", "upsample"])
 def test_help_and_mistakes_import_nothing_heavy(verb: str) -> None:
     code = f"""
         import sys
+        heavy = {{"torch", "lightning", "scipy", "open3d", "matplotlib"}}
         from pnu.commands.{verb} import main
         main(["--help"])
+        print(sorted({{*heavy, "hydra", "numpy", "pnu.io", "pnu.training"}} & sys.modules.keys()))
         try:
             main(["epochs=3"])
         except SystemExit:
-            print(sorted({{"torch", "lightning", "scipy", "open3d"}} & sys.modules.keys()))
+            print(sorted(heavy & sys.modules.keys()), "hydra" in sys.modules)
     """
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "[]"
+    assert done.stdout.splitlines()[-2:] == ["[]", "[] True"]
     assert "unknown key 'epochs'" in done.stderr
+
+
+@pytest.mark.parametrize("name", [path.stem for path in config_folder().glob("*.yaml") if path.stem != "command"])
+def test_what_help_reads_is_what_hydra_composes(name: str) -> None:
+    with composer(name) as compose:
+        assert written(config_folder() / f"{name}.yaml") == compose([])
+
+
+def test_a_file_that_asks_for_more_is_left_to_hydra(tmp_path: Path) -> None:
+    (tmp_path / "scale").mkdir()
+    (tmp_path / "scale" / "small.yaml").write_text("# @package _global_\nseed: 1\n")
+    (tmp_path / "a.yaml").write_text("defaults: [_self_, {scale: null}]\nseed: 0\n")
+    (tmp_path / "b.yaml").write_text("defaults: [_self_, {scale: small}]\nseed: 0\n")
+    assert written(tmp_path / "a.yaml") == {"seed": 0}
+    assert written(tmp_path / "b.yaml") is None
 
 
 def test_the_page_of_keys_has_the_words_of_the_constructors() -> None:

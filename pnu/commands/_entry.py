@@ -54,10 +54,8 @@ from pnu.config.compose import (
     spell,
     variations,
 )
-from pnu.config.help_text import help_text
+from pnu.config.help_text import help_text, written
 from pnu.config.schema import checked_config, config_folder, fields
-from pnu.training import optuna_search, sweeps
-from pnu.training.run_folder import INTERRUPTED, is_main_process
 
 
 def command(function: Callable[[Any], Any], schema: type, name: str | None = None) -> Callable[..., Any]:
@@ -86,6 +84,8 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
             if full_errors() or not (expected or in_multirun()):
                 raise
             if in_multirun():
+                from pnu.training import sweeps
+
                 raise sweeps.failed(error) from None
             stop(error)
 
@@ -101,19 +101,24 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
             return
         # before torch is there: on a busy machine, threads that spin while they wait make a step take seconds
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-        import hydra
-        from hydra._internal.utils import get_args_parser
-
-        parsed = get_args_parser().parse_args(arguments)
-        overrides = [o for o in parsed.overrides if not o.startswith("hydra.")]
-        goes_on = parsed.multirun and "trainer" in fields(schema)
         try:
+            if arguments == ["--help"] and (cfg := written(config_folder() / f"{name}.yaml")) is not None:
+                print(help_text(schema, quoting.program(name), checked_config(cfg, schema, complete=False)))
+                return
+            import hydra
+            from hydra._internal.utils import get_args_parser
+
+            parsed = get_args_parser().parse_args(arguments)
+            overrides = [o for o in parsed.overrides if not o.startswith("hydra.")]
+            goes_on = parsed.multirun and "trainer" in fields(schema)
             with composer(name, parsed.config_dir) as compose:
                 if parsed.help:
                     spelled = spell(overrides, schema, compose)
                     text = help_text(schema, quoting.program(name), checked(spelled, schema, compose, complete=False))
                     print(text)
                     return
+                from pnu.training import optuna_search, sweeps
+
                 if not parsed.multirun:
                     check_single(overrides)
                 if goes_on:
@@ -151,6 +156,8 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
                 else:
                     sweeps.run(start, Path(hydra_config.sweep.dir))
             except KeyboardInterrupt:
+                from pnu.training.run_folder import INTERRUPTED
+
                 print(f"stopped; start again with: {quoting.typed_line()}", file=sys.stderr)
                 sys.exit(INTERRUPTED)
 
@@ -170,6 +177,8 @@ def folder_arguments(config: Any, schema: type) -> list[str]:
     Raises:
         ValueError: `run` names another folder, or the command makes none.
     """
+    from pnu.training.run_folder import is_main_process
+
     given, changes = config.hydra.run.dir, config.hydra.job.chdir
     if changes and given == "." and "trainer" in fields(schema):
         if config.run is None:

@@ -8,9 +8,6 @@ from pnu.commands._entry import command
 from pnu.config.instantiate import PACKAGES, find_metric, instantiate
 from pnu.config.schema import Group, Groups, doc
 from pnu.runtime.provenance import machine
-from pnu.training.closing_lines import closing, job_line, objective
-from pnu.training.resuming import open_run
-from pnu.training.run_folder import is_main_process
 
 
 @dataclass
@@ -40,6 +37,10 @@ class Train:
 
 def train(cfg: Any) -> list[float] | None:
     """Train as the config says; the best validation's values of what the config names as objective."""
+    from pnu.training.closing_lines import closing, job_line, objective
+    from pnu.training.resuming import open_run
+    from pnu.training.run_folder import is_main_process
+
     run, config = open_run(cfg, Train)
     if run.skip:
         run.unlock()

@@ -136,9 +136,9 @@ def spell(overrides: list[str], schema: type, compose: Callable[..., Any]) -> li
     from omegaconf import OmegaConf
 
     parsed = parse(overrides)
-    choices = choices_of(compose)
     if not any("." in override.key_or_group for override in parsed):
         return overrides
+    choices = choices_of(compose)
     chosen = [raw for raw, override in zip(overrides, parsed, strict=True) if override.key_or_group in choices]
     shown = flatten(OmegaConf.to_container(compose([first_value(raw) for raw in chosen])))
     spelled = []

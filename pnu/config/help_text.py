@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from pnu.config.compose import group_choices
@@ -15,6 +16,33 @@ def shown(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def written(path: Path) -> Any:
+    """What Hydra composes of a file of conf/ where the command line says nothing, without waiting for Hydra.
+
+    The defaults list may hold files beside this one, a choice for each group and `_self_`; what it overrides of Hydra's
+    own, and the key `hydra`, are left out. None where a file asks for more.
+    """
+    from omegaconf import OmegaConf
+
+    if not path.is_file() or "@package" in path.read_text(encoding="utf-8"):
+        return None
+    own: Any = OmegaConf.load(path)
+    own.pop("hydra", None)
+    defaults = own.pop("defaults", [])
+    parts = []
+    for entry in defaults if "_self_" in defaults else [*defaults, "_self_"]:
+        if entry == "_self_":
+            parts.append(own)
+        elif isinstance(entry, str):
+            parts.append(written(path.with_name(f"{entry}.yaml")))
+        else:
+            for group, choice in entry.items():
+                if choice is not None and not group.startswith("override "):
+                    part = written(path.parent / group / f"{choice}.yaml")
+                    parts.append(None if part is None else {group: part})
+    return None if any(part is None for part in parts) else OmegaConf.merge(*parts)
 
 
 def help_text(schema: type, program: str, cfg: Any) -> str:
