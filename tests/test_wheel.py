@@ -5,11 +5,14 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from pnu.__main__ import verbs
 from pnu.data import shapes
@@ -32,6 +35,19 @@ for verb in set(verbs()) - {"doctor"}:  # which has no keys
     assert "quiet" in said.getvalue() and f"usage: pnu {verb}" in said.getvalue(), said.getvalue()
     print(verb)
 """
+
+
+def test_everything_that_is_asked_for_has_a_pin_that_fits() -> None:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pins = [Requirement(line) for line in lines if not line.startswith("#")]
+    versions = {canonicalize_name(pin.name): next(iter(pin.specifier)).version for pin in pins}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    asked = [*project["dependencies"], *(line for name in extras if name != "ray" for line in extras[name])]
+    unpinned = {"pnu", "triton"}  # itself; of Linux on x86-64 alone
+    for needed in map(Requirement, asked):
+        if needed.name not in unpinned:
+            assert needed.specifier.contains(versions[canonicalize_name(needed.name)], prereleases=True), needed
 
 
 @pytest.fixture(scope="module")
