@@ -30,6 +30,14 @@ class Upsample:
     output: str = doc("file to write; its suffix says the format")
     run: str = doc("run folder, or weights that come with pnu: surface, pnu ...; newest: the run that finished last")
     ratio: float = doc("points out for each point in, any number >= 1")
+    spacing: float | None = doc("instead of ratio: the distance wanted between points, in the cloud's unit")
+    density: str = doc(
+        "of surface: even; follow: every point becomes as many; auto: even where no place loses points by it"
+    )
+    keep: str = doc(
+        "of surface: true: the points read are among those written, unmoved; false: all are new; "
+        "auto: kept where evenly spread and without noise"
+    )
     normals: str = doc("auto: the file's, estimated where it has none; estimate: always estimated")
     columns: str | None = doc(
         "of text, or an array without names: x,y,z,_,r,g,b (_ is left out); null: by its names or the usual order"
@@ -79,8 +87,10 @@ def upsample(cfg: Any) -> None:
     from pnu.networks.checkpoints import NEWEST
     from pnu.upsamplers import whole_clouds
 
-    count, before = whole_clouds.output_count(len(cloud.points), cfg.ratio), cloud
-    cloud, stray = clean_cloud(cloud, outliers=cfg.outliers, lines=cfg.lines)
+    wanted = cfg.ratio if cfg.spacing is None else whole_clouds.ratio_of_spacing(cloud.points, cfg.spacing)
+    count, before = whole_clouds.output_count(len(cloud.points), wanted), cloud
+    keep = {"true": True, "false": False}.get(str(cfg.keep).lower(), cfg.keep)
+    cloud, stray = clean_cloud(cloud, outliers=cfg.outliers, lines="keep" if keep is True else cfg.lines)
     for note in cloud.notes[len(before.notes) :]:
         say(f"        {note}")
     if cfg.removed is not None:
@@ -98,7 +108,7 @@ def upsample(cfg: Any) -> None:
     )
     say(f"run:    {run}{chosen}")
     # a long one goes on, after an interruption, from the parts that are done
-    parts = Path(f"{cfg.output}.parts") if cfg.ratio * len(cloud.points) >= LONG else None
+    parts = Path(f"{cfg.output}.parts") if count >= LONG else None
     if parts is not None and parts.is_dir():
         say(f"parts:  {parts}, of an earlier start; what fits is taken")
     with stages(cfg.quiet) as progress:
@@ -106,6 +116,8 @@ def upsample(cfg: Any) -> None:
             cloud.points,
             cloud.normals,
             ratio=count / len(cloud.points),
+            density=cfg.density,
+            keep=keep,
             outliers="keep",
             lines="keep",
             model=checkpoints.load(run, cfg.allow) if cfg.allow else run,

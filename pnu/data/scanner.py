@@ -231,8 +231,9 @@ def _rays(sensor: np.ndarray, camera: Camera) -> np.ndarray:
     right = np.cross(ahead, UP if abs(ahead[2]) < 0.9 else UP[[2, 1, 0]])
     right /= np.linalg.norm(right)
     u, v = np.meshgrid(*(np.linspace(-camera.half, camera.half, count) for count in (camera.across, camera.down)))
-    rays: np.ndarray = u[..., None] * right + v[..., None] * np.cross(ahead, right) + ahead
-    return rays.reshape(-1, 3) / np.linalg.norm(rays, axis=-1).reshape(-1, 1)
+    rays = u[..., None] * right + v[..., None] * np.cross(ahead, right) + ahead
+    units: np.ndarray = rays.reshape(-1, 3) / np.linalg.norm(rays, axis=-1).reshape(-1, 1)
+    return units
 
 
 def _cast(scene: Any, sensor: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -48,8 +48,18 @@ def tangent_discs(points: Tensor, normals: Tensor, count: int, *, rank: int = RA
     return discs
 
 
-def repel(points: Tensor, normals: Tensor, *, steps: int, neighbors: int = 8, step: Step = silent) -> Tensor:
+def repel(
+    points: Tensor,
+    normals: Tensor,
+    *,
+    steps: int,
+    neighbors: int = 8,
+    step: Step = silent,
+    movable: int | None = None,
+) -> Tensor:
     """Even out the spacing: points (m, 3) push neighbors apart in their tangent planes, `steps` times.
+
+    Only the first `movable` move, all by default.
 
     Points push each other with a force that falls to zero at about the distance that evenly spread points have, so
     a cloud does not grow beyond its border. Points of sheets that look opposite ways ignore each other.
@@ -61,6 +71,7 @@ def repel(points: Tensor, normals: Tensor, *, steps: int, neighbors: int = 8, st
     step(0, total)
     order = along_curve(points)
     points, normals = points[order], normals[order]
+    free = (order < (m if movable is None else movable))[:, None].to(points)
     for _ in range(steps):
         search = Search(points)
         for part in parts:
@@ -77,6 +88,7 @@ def repel(points: Tensor, normals: Tensor, *, steps: int, neighbors: int = 8, st
             force = (1 - dist[part] / radius).clamp(min=0) * alike / dist[part].clamp(min=1e-9 * radius)
             push = 0.5 * radius * (force[..., None] * away).sum(1)
             push = push - (push * normals[part]).sum(-1, keepdim=True) * normals[part]
+            push = push * free[part]
             moved.append(points[part] + push * (0.3 * radius / push.norm(dim=-1, keepdim=True).clamp(min=0.3 * radius)))
         points = torch.cat(moved)
     back = torch.empty_like(points)

@@ -16,6 +16,10 @@ class Parts:
     def __init__(self, folder: Path | None = None) -> None:
         self.folder = folder
 
+    def within(self, name: str) -> "Parts":
+        """Others, in a folder of theirs, whose names may be the same."""
+        return Parts(None if self.folder is None else self.folder / name)
+
     def get(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
         """The tensor that `compute` gives, now or earlier under this name."""
         if self.folder is None:

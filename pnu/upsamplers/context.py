@@ -9,11 +9,12 @@ from torch import Tensor
 from pnu.runtime.parts import Parts
 from pnu.runtime.progress import Progress, silent
 from pnu.runtime.workers import Workers
+from pnu.upsamplers.density import Density
 
 
 @dataclass(frozen=True)
 class Context:
-    """How an upsampler runs. Only the generator has an influence on what comes out."""
+    """How an upsampler runs. Generator, density and keep have an influence on what comes out, nothing else."""
 
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     """Where the network lies, and the cloud."""
@@ -27,6 +28,10 @@ class Context:
     """Takes finished parts of a long computation, and has those of an earlier start."""
     workers: Workers | None = None
     """Who share the work of the network; None: this process does it."""
+    density: Density = "auto"
+    """Of what comes out: even, follow the cloud's, or auto: even where no place loses points by it."""
+    keep: bool = False
+    """Whether the points of the cloud are to be among those that come out, unmoved."""
 
 
 @runtime_checkable
@@ -37,6 +42,7 @@ class Upsampler(Protocol):
         """cloud (n, 6), points and unit normals -> (count, 6), or (count, 3) without normals.
 
         Both in the unit sphere, where `pnu.upsample` brings clouds, in float64; the normals that come out may have any
-        length. An upsampler with an attribute `parallel` that is true gives work to `context.workers`.
+        length. An upsampler with an attribute `parallel` that is true gives work to `context.workers`,
+        one with `follows` minds `context.density` and `context.keep`.
         """
         ...

@@ -4,30 +4,35 @@ There are no patches, hence no borders; the cost grows with the output; any rati
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from pnu.geometry.even_spacing import repel, tangent_discs
 from pnu.geometry.local_frames import feet
-from pnu.geometry.neighbor_search import Search, knn
+from pnu.geometry.neighbor_search import Search, knn, nearest
 from pnu.geometry.noise_level import noise_level
 from pnu.geometry.sampling import farthest_points_large
 from pnu.geometry.spacing import spacing
 from pnu.geometry.spatial_blocks import along_curve
 from pnu.networks.surface import Surface
 from pnu.runtime import threads
-from pnu.runtime.progress import Step, silent
+from pnu.runtime.progress import Progress, Step, silent
 from pnu.runtime.workers import Begin, InProcess, Work, Workers
 from pnu.upsamplers.context import Context
+from pnu.upsamplers.density import groups_of_like_spacing, point_counts
 
+EVEN = 0.3  # standard deviation over mean of the nearest distance; 0.52 at random
 SMOOTH = 0.1  # noise in spacings from which on a cloud is smoothed first
 KEPT = 2**19  # queries whose projections are kept in one file
 BATCH = 512  # queries at once on a CPU,
 BATCHES = 32  # of which its threads share so many
 AROUND = 8  # points of which one at most is dropped,
 DOUBTFUL = 16  # looked for among so many for each point to drop
+ROOM = 0.7  # around a point that is kept, in spacings that evenly spread points would have
 CLOSE = 12  # neighbors of the sphere that candidates are first moved to
 
 
@@ -38,6 +43,7 @@ class SurfaceProjection:
     """
 
     parallel = True
+    follows = True
 
     def __init__(self, network: Surface) -> None:
         self.network = network
@@ -48,30 +54,72 @@ class SurfaceProjection:
 
         The points of a cloud that is noisy beside their spacing are themselves projected first.
         """
-        network, parts, in_process = self.network, context.parts, InProcess(self.network)
-        project = partial(projections, batch_size=context.batch_size)
-        run = partial(in_parts, project, workers=context.workers or in_process, context=context)
-
-        def step(stage: str) -> Step:
-            return partial(context.progress, stage)
-
         if noise_in_spacings(cloud) > SMOOTH:
-            cloud, _ = run(cloud, cloud, stage="smoothing, the points are noisy")
-        each = max(1, round(network.seeds * count / len(cloud)))
-        candidates, some = round(network.candidates * count), round(network.shortlist * count)
-        more = round((1 + network.reject) * count)
-        query = parts.get("seeds", lambda: seeds_around(cloud, each, candidates, step("seeds"))).to(cloud)
+            smooth, _ = self.projected(cloud, cloud, context, "smoothing, the points are noisy")
+            measured, cloud = cloud, smooth
+        else:
+            measured = cloud
+        places = cloud[:, :3].cpu().numpy()
+        counts = point_counts(places, count, context.density)
+        if counts is None:
+            return self.spread(cloud, cloud[:0] if not context.keep else measured, len(cloud), count, context)
+        found = []
+        for number, (rows, some) in enumerate(groups_of_like_spacing(places, counts, count)):
+            others = np.setdiff1d(np.arange(len(cloud)), rows)
+            kept = measured[rows] if context.keep else measured[:0]
+            named = partial(_named, context.progress, f"density {number + 1}, ")
+            part = replace(context, progress=named, parts=context.parts.within(f"density_{number + 1}"))
+            found.append(self.spread(cloud[np.concatenate([rows, others])], kept, len(rows), some, part))
+        return torch.cat(found)
+
+    def spread(self, cloud: Tensor, kept: Tensor, first: int, count: int, context: Context) -> Tensor:
+        """Evenly spread points (count, 6) where the first points of a cloud (n, 6) are the nearest of its points.
+
+        Those that are `kept` (k, 6) come first, as they are but for their normals; others fill the places between.
+        """
+        network, in_process = self.network, InProcess(self.network)
+        new = count - len(kept)
+        if new <= 0:
+            return self.with_normals(kept[:count], cloud, context)
+
+        def named(name: str, compute: Callable[[Step], Tensor]) -> Tensor:
+            """A part by the name of its stage, on the cloud's device."""
+            stage = partial(context.progress, name)
+            return context.parts.get(name, lambda: compute(stage)).to(cloud)
+
+        each = max(1, round(network.seeds * new / first))
+        candidates, some, more = (
+            round(share * new) for share in (network.candidates, network.shortlist, 1 + network.reject)
+        )
+        query = named("seeds", lambda step: seeds_around(cloud, each, candidates, step, first=first))
         if network.projector.sphere:
             to_sphere = partial(spheres, batch_size=context.batch_size)
             query, _ = in_parts(to_sphere, query, cloud, workers=in_process, context=context, stage="spheres")
-        query = parts.get("shortlist", lambda: thin(query, some, step("shortlist"))).to(cloud)
-        query, error = run(query, cloud, stage="projection")
-        query = parts.get("thinned", lambda: thin(query, more, step("thinning"))).to(cloud)
+        query = named("shortlist", lambda step: thin_between(query, some, kept, step))
+        query, error = self.projected(query, cloud, context, "projection")
+        query = named("thinning", lambda step: thin_between(query, more, kept, step))
         if network.relaxation:
-            query = parts.get("even", lambda: even_out(query, network.relaxation, step("even spacing"))).to(cloud)
+            query = named("even spacing", lambda step: even_out(query, network.relaxation, step, kept))
         for i in range(network.refinements):
-            query, error = run(query, cloud, stage=f"refinement {i + 1}")
-        return query[reject_worst(query[:, :3], error, count)]
+            query, error = self.projected(query, cloud, context, f"refinement {i + 1}")
+        query = query[reject_worst(query[:, :3], error, new)]
+        return torch.cat([self.with_normals(kept, cloud, context), query]) if len(kept) else query
+
+    def projected(self, query: Tensor, cloud: Tensor, context: Context, stage: str) -> tuple[Tensor, Tensor]:
+        """Queries (m, 6) on the surface of a cloud (n, 6), and the logarithm of their expected error (m,)."""
+        project = partial(projections, batch_size=context.batch_size)
+        return in_parts(
+            project, query, cloud, workers=context.workers or InProcess(self.network), context=context, stage=stage
+        )
+
+    def with_normals(self, kept: Tensor, cloud: Tensor, context: Context) -> Tensor:
+        """Points (k, 6) with the normals that the network finds at their places."""
+        there, _ = self.projected(kept, cloud, context, "normals of the points kept")
+        return torch.cat([kept[:, :3], there[:, 3:]], 1)
+
+
+def _named(progress: Progress, prefix: str, stage: str, done: int, total: int) -> None:
+    progress(prefix + stage, done, total)
 
 
 def in_parts(
@@ -156,19 +204,33 @@ def noise_in_spacings(cloud: Tensor) -> float:
     return noise_level(cloud[:, :3], cloud[:, 3:]) / spacing(cloud[:, :3].cpu().numpy())
 
 
-def seeds_around(cloud: Tensor, each: int, count: int, step: Step = silent) -> Tensor:
-    """Points of a cloud (n, 6) and `each` seeds around each, thinned to (count, 6), with the points' normals."""
+def is_clean_and_even(cloud: Tensor) -> bool:
+    """Whether the points of a cloud (n, 6) are evenly spread, as farthest points are, and show no noise."""
+    nearest_sq = knn(cloud[None, :, :3], cloud[None, :, :3], 2).dist_sq[0, :, 1]
+    apart = nearest_sq.sqrt()
+    return bool(apart.std() < EVEN * apart.mean()) and noise_in_spacings(cloud) < SMOOTH
+
+
+def seeds_around(cloud: Tensor, each: int, count: int, step: Step = silent, *, first: int | None = None) -> Tensor:
+    """Points of a cloud (n, 6) and `each` seeds around each, thinned to (count, 6), with the points' normals.
+
+    With `first` those around the first points alone, and only where no other point is nearer.
+    """
     step(0, 1)
-    discs = tangent_discs(cloud[:, :3], cloud[:, 3:], each)
-    places = torch.cat([cloud[:, :3], discs.flatten(0, 1)])
+    first = len(cloud) if first is None else first
+    discs = tangent_discs(cloud[:, :3], cloud[:, 3:], each, first=first)
+    places = torch.cat([cloud[:first, :3], discs.flatten(0, 1)])
+    owner = torch.cat([torch.arange(first), torch.arange(first).repeat_interleave(each)]).to(cloud.device)
     del discs
+    if first < len(cloud):
+        own = nearest(places[None], cloud[None, :, :3]).idx[0] < first
+        places, owner = places[own], owner[own]
     if len(places) <= count:
         kept = torch.arange(len(places), device=cloud.device)
         step(1, 1)
     else:
         kept = torch.from_numpy(farthest_points_large(places, count, step=step)).to(cloud.device)
-    owner = torch.where(kept < len(cloud), kept, (kept - len(cloud)) // each)
-    return torch.cat([places[kept], cloud[owner, 3:]], 1)
+    return torch.cat([places[kept], cloud[owner[kept], 3:]], 1)
 
 
 def reject_worst(points: Tensor, error: Tensor, count: int) -> Tensor:
@@ -186,9 +248,21 @@ def reject_worst(points: Tensor, error: Tensor, count: int) -> Tensor:
     return stays.nonzero()[:, 0]
 
 
-def even_out(cloud: Tensor, steps: int, step: Step = silent) -> Tensor:
-    """A cloud (m, 6) with points moved to an even spacing."""
-    return torch.cat([repel(cloud[:, :3], cloud[:, 3:], steps=steps, step=step), cloud[:, 3:]], 1)
+def even_out(cloud: Tensor, steps: int, step: Step = silent, kept: Tensor | None = None) -> Tensor:
+    """A cloud (m, 6) with points moved to an even spacing, between points (k, 6) that stay where they are."""
+    everything = cloud if kept is None else torch.cat([cloud, kept])
+    moved = repel(everything[:, :3], everything[:, 3:], steps=steps, step=step, movable=len(cloud))
+    return torch.cat([moved[: len(cloud)], cloud[:, 3:]], 1)
+
+
+def thin_between(cloud: Tensor, count: int, kept: Tensor, step: Step = silent) -> Tensor:
+    """Farthest points of a cloud (n, 6) that leave room around those kept (k, 6): (min(n, count), 6)."""
+    if len(kept) and len(cloud) > count:
+        even = spacing(kept[:, :3].cpu().numpy()) * (len(kept) / (len(kept) + count)) ** 0.5
+        apart = nearest(cloud[None, :, :3], kept[None, :, :3]).dist_sq[0].sqrt()
+        enough = apart.sort(descending=True).values[count - 1]  # so many have to stay
+        cloud = cloud[apart >= torch.minimum(enough, apart.new_tensor(ROOM * even))]
+    return thin(cloud, count, step)
 
 
 def thin(cloud: Tensor, count: int, step: Step = silent) -> Tensor:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -27,7 +27,9 @@ from pnu.runtime.parts import Parts
 from pnu.runtime.progress import Progress, silent
 from pnu.runtime.workers import Processes
 from pnu.upsamplers import CLASSICAL, Context, Upsampler, classical, upsampler_of
+from pnu.upsamplers.density import DENSITIES, Density, count_of_spacing
 from pnu.upsamplers.patches import with_unit_normals
+from pnu.upsamplers.surface_projection import is_clean_and_even
 
 MINIMUM = 16  # points of a cloud
 LARGEST = 10**9  # points of an output
@@ -38,8 +40,11 @@ def upsample(
     normals: np.ndarray | None = None,
     *,
     ratio: float = 4,
+    spacing: float | None = None,
     model: nn.Module | Upsampler | str | PathLike[str] = "surface",
     patch_size: int | None = None,
+    density: Density = "auto",
+    keep: bool | Literal["auto"] = "auto",
     outliers: Treatment = "auto",
     lines: Treatment = "auto",
     device: str = "auto",
@@ -60,10 +65,16 @@ def upsample(
             `pnu.io.check_cloud` tells what it finds.
         normals: (n, 3), of any length; estimated and oriented where missing, zero or NaN here and in points.
         ratio: points out for each point in, any number >= 1.
+        spacing: instead of ratio, the distance wanted between points, in their unit; so many come out as have it if
+            evenly spread.
         model: network, run folder, file of weights, the name of weights that come with pnu (`pnu.weights`), "newest",
             the run that finished last under outputs/, or an upsampler: "apss", "poisson", "midpoint", or one's own.
             "surface" takes the weights made for estimated normals where none are given.
         patch_size: points of a patch, at least 16; None: what the network was made for. "surface" has no patches.
+        density: of the points of "surface". "even" over the surface; "follow": each point becomes `ratio`; "auto": even
+            where no place loses points by it, elsewhere those that it has.
+        keep: of "surface". True: the points given are among those that come out, first and unmoved, and new ones fill
+            between; False: all are new; "auto": kept where they are evenly spread and show no noise.
         outliers: "auto": stray points are taken out first, and not counted less for it: n stays; "keep": none is.
         lines: "auto": scan lines, dense along and sparse across, are thinned out first; "keep": they stay.
         device: "auto" (where the given network is; else CUDA where there is one), "cpu", "cuda", "cuda:1" ...
@@ -84,7 +95,7 @@ def upsample(
     The network comes back as it was, modes and device too; generators and settings of torch are left alone.
     """
     given = _given(points, normals)
-    count = output_count(len(given.points), ratio)
+    count = output_count(len(given.points), ratio if spacing is None else ratio_of_spacing(given.points, spacing))
     sizes = (
         ("patch_size", patch_size, MINIMUM),
         ("batch_size", batch_size, 1),
@@ -94,15 +105,29 @@ def upsample(
     for name, value, least in sizes:
         if value is not None and not (isinstance(value, Integral) and value >= least):
             raise ValueError(f"{name}={value}: expected a whole number >= {least}")
-    given = clean_cloud(given, outliers=outliers, lines=lines).cloud
+    if density not in DENSITIES:
+        raise ValueError(f"density={density}: expected {', '.join(DENSITIES)}")
+    if keep not in (True, False, "auto"):
+        raise ValueError(f"keep={keep}: expected true, false or auto")
+    given = clean_cloud(given, outliers=outliers, lines="keep" if keep is True else lines).cloud
     network, target = _on_device(*_model(model, given.normals), device)
     upsampler = upsampler_of(network, patch_size)
     if devices > 1 and not getattr(upsampler, "parallel", False):
         raise ValueError(f"devices={devices}: {type(network).__name__} works in one process; leave devices=1")
     names = _names(target, devices)
     sparse, frame = _prepare(given, progress)
-    finished = Parts() if parts is None else Parts(Path(parts) / _digest(network, sparse, count, upsampler))
-    context = Context(target, batch_size, torch.Generator().manual_seed(seed), progress, finished)
+    if not getattr(upsampler, "follows", False) and (density == "follow" or keep is True):
+        asked = "density=follow" if density == "follow" else "keep=true"
+        raise ValueError(
+            f"{asked}: {type(network).__name__} spreads new points evenly; take model surface (run=surface)"
+        )
+    follows = getattr(upsampler, "follows", False)
+    keeps = (follows and is_clean_and_even(sparse)) if keep == "auto" else keep
+    digest = _digest(network, sparse, count, upsampler, density, keeps)
+    finished = Parts() if parts is None else Parts(Path(parts) / digest)
+    context = Context(
+        target, batch_size, torch.Generator().manual_seed(seed), progress, finished, density=density, keep=keeps
+    )  # fmt: skip
     with torch.no_grad(), evaluating(network), accelerated(modules_of(network)), ExitStack() as stack:
         if torch.get_default_device().type != "cpu":
             stack.enter_context(torch.device("cpu"))
@@ -110,7 +135,23 @@ def upsample(
             context = replace(context, workers=stack.enter_context(Processes(copy.deepcopy(network).cpu(), names)))
         raw = upsampler.upsample_cloud(sparse.to(target), count, context)
         dense = with_unit_normals(raw.cpu().double(), sparse)
-    return frame.from_unit(dense[None])[0].numpy()
+    found = frame.from_unit(dense[None])[0].numpy()
+    return _measured_first(found, dense, sparse, given) if keeps else found
+
+
+def _measured_first(found: np.ndarray, unit: Tensor, sparse: Tensor, given: Cloud) -> np.ndarray:
+    """The points found (m, 6), those first that were given: in their order, not moved by a bit, with their normals.
+
+    In the unit sphere they are `unit` (m, 6), and those given `sparse` (n, 6), sorted.
+    """
+    rows = np.empty(len(sparse), np.int64)
+    rows[np.lexsort(given.points.T)] = cKDTree(unit[:, :3].numpy()).query(sparse[:, :3].numpy())[1]
+    kept = found[rows]
+    kept[:, :3] = given.points
+    if given.normals is not None:
+        known = np.isfinite(given.normals[:, 0])
+        kept[known, 3:] = given.normals[known]
+    return np.vstack([kept, np.delete(found, rows, axis=0)])
 
 
 def attributes(dense: np.ndarray, cloud: Cloud) -> dict[str, np.ndarray]:
@@ -122,6 +163,18 @@ def attributes(dense: np.ndarray, cloud: Cloud) -> dict[str, np.ndarray]:
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     sparse = np.hstack([cloud.points, normals / np.maximum(length, 1e-300)])
     return {name: carry(dense, sparse, values) for name, values in cloud.attributes.items()}
+
+
+def ratio_of_spacing(points: np.ndarray, spacing: float) -> float:
+    """The ratio by which points (n, 3) get that spacing; `ValueError` if that is none, or wider than they have."""
+    if not (isinstance(spacing, Real) and 0 < spacing < float("inf")):
+        raise ValueError(f"spacing={_short(spacing)}: expected a length > 0 in the unit of the points")
+    ratio = count_of_spacing(points, float(spacing)) / len(points)
+    if ratio < 1:
+        raise ValueError(
+            f"spacing={spacing:g}: the points are nearer to each other, {spacing * ratio**0.5:.3g}; give a smaller one"
+        )
+    return ratio
 
 
 def output_count(n: int, ratio: float) -> int:
@@ -260,7 +313,7 @@ def _names(target: torch.device, devices: int) -> list[str]:
     return [f"cuda:{number}" for number in range(devices)]
 
 
-def _digest(network: Any, sparse: Tensor, count: int, upsampler: object) -> str:
+def _digest(network: Any, sparse: Tensor, count: int, upsampler: object, *options: object) -> str:
     """Of all that the parts of a computation depend on."""
     digest = hashlib.sha256(sparse.numpy().tobytes())
     for name, value in network.state_dict().items() if modules_of(network) else ():
@@ -271,7 +324,7 @@ def _digest(network: Any, sparse: Tensor, count: int, upsampler: object) -> str:
         for name, value in sorted(vars(module).items())
         if name != "training" and isinstance(value, int | float | str)
     ]
-    digest.update(repr((type(network).__name__, count, plain, __version__, torch.__version__)).encode())
+    digest.update(repr((type(network).__name__, count, options, plain, __version__, torch.__version__)).encode())
     return digest.hexdigest()[:16]
 
 
