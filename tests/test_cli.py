@@ -8,14 +8,20 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 import torch
+import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from pnu.commands.train import main
+from pnu.commands.upsample import main as upsample
 from pnu.networks.checkpoints import read
+from pnu.training import resuming
+from tests.commands import refused
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -77,6 +83,58 @@ def test_help_tells_every_key_with_its_value(tmp_path: Path) -> None:
     assert "loss.w3=0.25" in done.stdout
     assert "trainer.max_epochs=500" in done.stdout
     assert "model=" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["run=run"],
+        ["experiment=surface", "data.root=null", "run=run", "model.width=8", "callbacks=[default,ema]"],
+        ["scale=small", "hydra.run.dir=run", "quiet=true", "data=patches", "data.path=a.h5"],
+    ],
+)
+def test_cfg_prints_the_config_that_the_run_folder_has(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    main([*arguments, "--cfg", "job", "--resolve"])
+    printed = capsys.readouterr().out
+    main(["--cfg", "job", *arguments])
+    written = capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == []
+
+    real = resuming.open_run
+
+    def opened(*given: Any) -> Any:
+        real(*given)
+        raise ValueError("that is enough")
+
+    monkeypatch.setattr("pnu.training.resuming.open_run", opened)
+    refused(capsys, main, arguments)
+    assert printed == (tmp_path / "run" / "config.yaml").read_text()
+    # without --resolve, references stay as conf/ writes them, beside the values that constructors fill in
+    assert "seed: ${seed}" in written
+    found, filled = yaml.safe_load(written), yaml.safe_load(printed)
+    references = [key for group in ("data", "scheduler") for key, v in found[group].items() if "${" in str(v)]
+    assert references
+    assert found["model"] == filled["model"]
+    assert found["data"] | {key: filled["data"][key] for key in references if key in filled["data"]} == filled["data"]
+
+
+def test_cfg_prints_a_part_of_the_config(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["--cfg", "job", "--package", "loss", "loss.k=7"])
+    out = capsys.readouterr().out
+    assert out.startswith("# @package loss\n")
+    assert "k: 7\n" in out
+    assert "reduction: mean\n" in out  # of the constructor
+    main(["--cfg", "job", "--package", "loss.k"])
+    assert capsys.readouterr().out == "15\n"
+    assert "package nothing: " in refused(capsys, main, ["--cfg", "job", "--package", "nothing"])
+    main(["--cfg", "hydra", "--package", "hydra.job"])
+    assert "name: train" in capsys.readouterr().out
+    assert "loss.k=many: expected int" in refused(capsys, main, ["--cfg", "job", "loss.k=many"])
+    upsample(["--cfg", "job"])  # what is still to be given stays so
+    assert "input: ???\n" in capsys.readouterr().out
 
 
 def test_help_tells_the_keys_of_a_command_before_those_of_groups() -> None:

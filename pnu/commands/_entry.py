@@ -50,6 +50,7 @@ from pnu.config.compose import (
     fitted,
     in_multirun,
     one_line,
+    printed,
     said,
     spell,
     variations,
@@ -138,6 +139,11 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
                     config = checked(one, schema, compose)
                     if goes_on:
                         sweeps.check_job(config)
+                if parsed.cfg == "job" and not parsed.multirun:
+                    added = folder_arguments(compose([*overrides, *hydras_own(parsed.overrides)], True), schema)
+                    overrides += [o for o in added if not o.startswith("hydra.")]
+                    print(printed(overrides, schema, compose, parsed.package, resolve=parsed.resolve), end="")
+                    return
                 if goes_on:
                     hydra_config = compose([*next(variations(overrides)), *hydras_own(parsed.overrides)], True).hydra
                     Path(hydra_config.sweep.dir).mkdir(parents=True, exist_ok=True)

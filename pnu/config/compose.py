@@ -78,6 +78,35 @@ def checked(overrides: Sequence[str], schema: type, compose: Callable[..., Any],
     return checked_config(own, schema, complete=complete)
 
 
+def printed(
+    overrides: Sequence[str], schema: type, compose: Callable[..., Any], package: str | None, *, resolve: bool
+) -> str:
+    """What `--cfg job` prints: the config as `checked` makes it for the command, as YAML.
+
+    Args:
+        package: the part of it to print, null: all.
+        resolve: with the values of references; without, what refers to another key does so still.
+
+    Raises:
+        ValueError: a value that does not fit, or no such package.
+    """
+    from omegaconf import Container, OmegaConf
+
+    cfg = checked(overrides, schema, compose, complete=False)
+    if not resolve:
+        plain: Any = OmegaConf.to_container(cfg)
+        written: Any = OmegaConf.to_container(compose(list(overrides)))
+        for key, value in flatten(written).items():
+            if key in flatten(plain) and isinstance(value, str) and "${" in value:
+                OmegaConf.update(cfg, key, value)
+    if package in (None, "_global_"):
+        return OmegaConf.to_yaml(cfg)
+    found = OmegaConf.select(cfg, str(package))
+    if found is None:
+        raise ValueError(f"package {package}: is not in the config")
+    return f"# @package {package}\n{OmegaConf.to_yaml(found)}" if isinstance(found, Container) else f"{found}\n"
+
+
 def parse(overrides: list[str]) -> list[Any]:
     """Overrides as Hydra's parser reads them; `ValueError` with a hint on quotes."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
