@@ -14,7 +14,9 @@ from pnu.geometry.outlier_features import outlier_features
 from pnu.networks.outlier_detector import OutlierDetector
 
 WEIGHTS = Path(__file__).with_name("outliers.safetensors")
-SURE = 2.0  # logarithm of the odds from which on a point is taken for stray
+SURE = 3.0  # logarithm of the odds from which on a point is taken for stray,
+LIKELY = 1.2  # or this where there are many: a share of
+MANY = 0.01  # of the points is sure
 ROUNDS = 3  # a stray point hides another
 PIECE = 12  # points below which a piece that stands apart is stray
 APART = 6.0  # usual spacings between a piece and all others
@@ -32,19 +34,21 @@ def detector() -> OutlierDetector:
     return network.eval()
 
 
-def stray_points(points: NDArray[np.float64], *, sure: float = SURE) -> NDArray[np.bool_]:
+def stray_points(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which of the points (n, 3) are stray, (n,): by the detector, then pieces of a few points that stand apart.
 
     Rows may be in any order; place, rotation and size have no influence. Clouds of fewer than 64 points have none.
     """
-    stays = np.ones(len(points), bool)
+    stays, enough = np.ones(len(points), bool), SURE
     for _ in range(ROUNDS):
         rows = np.flatnonzero(stays)
         if len(rows) < FEWEST:
             break
         with torch.inference_mode():
             odds = detector()(torch.from_numpy(outlier_features(points[rows]))).numpy()
-        stray = odds > sure
+        if (odds > SURE).mean() > MANY:
+            enough = LIKELY
+        stray = odds > enough
         stays[rows[stray]] = False
         if not stray.any():
             break

@@ -1,0 +1,40 @@
+"""How good a cloud made from a scan is, where the true mesh is known, and which part of it the scan has seen."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+STRAY = 0.03  # distance from the true surface beyond which a point is stray
+
+LEGEND = (
+    "accuracy: mean distance of the points to the true mesh; p95: its 95th percentile; stray: % farther than 0.03; "
+    "complete: mean distance of points of the surface that was seen to the next point; gap: the largest; all lengths "
+    "x 1e3, in the unit sphere; normal: mean unsigned error in degrees; flipped: % that look inward."
+)
+COLUMNS = ("accuracy", "p95", "stray", "complete", "gap", "normal", "flipped")
+
+
+def scan_scores(
+    cloud: NDArray[np.float64], seen: NDArray[np.float64], closest: NDArray[np.float64], true: NDArray[np.float64]
+) -> dict[str, float]:
+    """Scores of a cloud (m, 6), see `LEGEND`.
+
+    seen: points (s, 3) of the true surface where the scan has points. closest, true: the point of the true mesh closest
+    to each of the cloud, and the unit normal there, (m, 3) each.
+    """
+    distance = np.linalg.norm(cloud[:, :3] - closest, axis=1)
+    back = cKDTree(cloud[:, :3]).query(seen)[0]
+    length = np.linalg.norm(cloud[:, 3:], axis=1) * np.linalg.norm(true, axis=1)
+    cosine = np.clip((cloud[:, 3:] * true).sum(1) / np.maximum(length, 1e-300), -1, 1)
+    scores: dict[str, Any] = {
+        "accuracy": 1e3 * distance.mean(),
+        "p95": 1e3 * np.quantile(distance, 0.95),
+        "stray": 100 * (distance > STRAY).mean(),
+        "complete": 1e3 * back.mean(),
+        "gap": 1e3 * back.max(),
+        "normal": np.degrees(np.arccos(np.abs(cosine))).mean(),
+        "flipped": 100 * (cosine < 0).mean(),
+    }
+    return {name: float(value) for name, value in scores.items()}
