@@ -17,9 +17,9 @@ import torch
 from torch import nn
 
 from pnu import metrics, reconstruction
-from pnu.benchmark import Case, Row, columns, source, summarize
+from pnu.benchmark import Case, Row, case_source, columns, summarize
 from pnu.benchmark.cases import generator
-from pnu.benchmark.result_tables import cell
+from pnu.benchmark.result_tables import row_cell
 from pnu.geometry.mesh_topology import vertex_normals
 from pnu.geometry.normal_estimation import estimate_normals
 from pnu.io import atomic_path, read_json, write_cloud, write_json, write_mesh
@@ -134,7 +134,7 @@ def cloud_lines(rows: list[Row]) -> list[str]:
     heads = [one.head for one in shown]
     lines = [f"| input | method | {' | '.join(heads)} |", "|---|---|" + "---|" * len(shown)]
     for summary in summarize(rows):
-        cells = (cell(summary, one) for one in shown)
+        cells = (row_cell(summary, one) for one in shown)
         lines.append(f"| {summary['kind']} | {summary['method']} | {' | '.join(cells)} |")
     return lines
 
@@ -178,7 +178,7 @@ def main() -> None:
     arguments.output.mkdir(parents=True, exist_ok=True)
     for name in arguments.settings:
         setting = SETTINGS[name]
-        found = source(data, ["random"], only=arguments.shapes, seed=arguments.seed, warn=lambda text: None)
+        found = case_source(data, ["random"], only=arguments.shapes, seed=arguments.seed, warn=lambda text: None)
         cases = list(inputs(found.cases, setting, arguments.seed))
         path = arguments.output / f"quality_{name}.json"
         content = read_json(path) if path.is_file() else {"rows": [], "surfaces": []}

@@ -58,7 +58,7 @@ class Point(NamedTuple):
 
 def network(name: str) -> str | nn.Module:
     """Weights that ship, or the paper's network as it begins: with offsets, so that points lie near the surface."""
-    if name in weights.names():
+    if name in weights.shipped_names():
         return name
     torch.manual_seed(0)
     return PNU(residual=True)

@@ -121,7 +121,7 @@ def test_broken_file(run: Path, content: bytes) -> None:
 
 def test_numpy_scalars_are_plain(tmp_path: Path) -> None:
     torch.save({"loss": np.float32(0.25), "epoch": np.int64(3), "other": np.float64(0.5)}, tmp_path / "a.pt")
-    assert checkpoints.read(tmp_path / "a.pt") == {"loss": 0.25, "epoch": 3, "other": 0.5}
+    assert checkpoints.read_checkpoint(tmp_path / "a.pt") == {"loss": 0.25, "epoch": 3, "other": 0.5}
 
 
 def test_newest_run(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from pnu.commands.train import main
 from pnu.commands.upsample import main as upsample
-from pnu.networks.checkpoints import read
+from pnu.networks.checkpoints import read_checkpoint
 from pnu.training import resuming
 from tests.commands import refused
 
@@ -168,7 +168,7 @@ def test_one_line_trains(tmp_path: Path, small: list[str]) -> None:
     (run,) = tmp_path.glob("outputs/*/*_train")
     assert f"next: pnu upsample input=cloud.ply output=dense.ply run={run.relative_to(tmp_path)}" in done.stdout
     assert "CD x 1e3" in done.stdout
-    assert read(run / "checkpoints/last.ckpt")["global_step"] == 20
+    assert read_checkpoint(run / "checkpoints/last.ckpt")["global_step"] == 20
 
 
 def test_a_multirun_leaves_a_complete_folder_for_each_value(tmp_path: Path, small: list[str]) -> None:
@@ -182,7 +182,7 @@ def test_a_multirun_leaves_a_complete_folder_for_each_value(tmp_path: Path, smal
         assert set(json.loads((run / "metrics.json").read_text())) == {"untrained", "validation", "test"}
         assert (run / "checkpoints/best.ckpt").exists()
         assert list((run / "tensorboard").glob("events*"))
-    first, second = (read(run / "checkpoints/last.ckpt")["state_dict"] for run in runs)
+    first, second = (read_checkpoint(run / "checkpoints/last.ckpt")["state_dict"] for run in runs)
     assert any(not torch.equal(first[name], second[name]) for name in first)
 
 
@@ -208,10 +208,10 @@ def test_killed_and_resumed_as_if_never_stopped(tmp_path: Path, small: list[str]
     process.communicate()
     assert process.returncode == -signal.SIGKILL, "it ended before it could be killed"
     assert json.loads((tmp_path / "killed/run.json").read_text())["status"] == "running"
-    stopped_at = read(last)["global_step"]
+    stopped_at = read_checkpoint(last)["global_step"]
     assert train(tmp_path, f"run={tmp_path / 'killed'}", "resume=true", "quiet=true").returncode == 0
     assert train(tmp_path, *options, f"run={tmp_path / 'whole'}").returncode == 0
-    killed, whole = (read(tmp_path / name / "checkpoints/last.ckpt") for name in ("killed", "whole"))
+    killed, whole = (read_checkpoint(tmp_path / name / "checkpoints/last.ckpt") for name in ("killed", "whole"))
     assert 0 < stopped_at < killed["global_step"] == whole["global_step"] == 30
     assert all(torch.equal(killed["state_dict"][name], value) for name, value in whole["state_dict"].items())
     assert json.loads((tmp_path / "killed/run.json").read_text())["status"] == "finished"

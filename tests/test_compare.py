@@ -163,7 +163,7 @@ def case() -> Case:
 
 
 def test_a_surface_that_fails_is_left_out_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = comparison_page.Shown.of(case())
+    shown = comparison_page.ShownCase.of(case())
     shown.clouds["bare"] = shown.clouds["input"][:, :3]
 
     def fail(*args: object, **kwargs: object) -> None:
@@ -176,7 +176,7 @@ def test_a_surface_that_fails_is_left_out_and_said(monkeypatch: pytest.MonkeyPat
 
 
 def test_clouds_are_thinned_to_the_size_of_the_page() -> None:
-    shown = comparison_page.Shown.of(case())
+    shown = comparison_page.ShownCase.of(case())
     drawings = view(shown, {}, 90).drawings
     assert [len(drawing.cloud) for drawing in drawings if drawing.cloud is not None] == [67, 89]
     assert points_for(40, 100, 0) == 33333

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from pnu.data import shapes
-from pnu.data.patch_dataset import EpochSampler, Options, PatchDataset, split
+from pnu.data.patch_dataset import EpochSampler, Options, PatchDataset, split_shapes
 from pnu.data.patch_file import cut_patch_file
 from pnu.data.patch_module import MeshDataModule, PatchDataModule, SyntheticDataModule
 from pnu.io import write_mesh
@@ -147,24 +147,24 @@ def test_processes_share_an_epoch() -> None:
 
 def test_split_by_shape() -> None:
     names = [f"s{i // 7}" for i in range(70)]
-    rows = split(names, 70, val=0.2, test=0.1, seed=0)
+    rows = split_shapes(names, 70, val=0.2, test=0.1, seed=0)
     kinds = {part: {names[row] for row in rows[part]} for part in rows}
     assert [len(kinds[part]) for part in ("train", "val", "test")] == [7, 2, 1]
     assert not kinds["train"] & kinds["val"]
     assert not kinds["test"] & (kinds["train"] | kinds["val"])
     assert sum(map(len, rows.values())) == 70
-    assert rows == split(names, 70, val=0.2, test=0.1, seed=0)
+    assert rows == split_shapes(names, 70, val=0.2, test=0.1, seed=0)
 
 
 def test_split_without_names_takes_blocks() -> None:
-    rows = split(None, 100, val=0.1, test=0.1, seed=0)
+    rows = split_shapes(None, 100, val=0.1, test=0.1, seed=0)
     assert rows["train"] == list(range(80))
     assert rows["test"] == list(range(90, 100))
 
 
 def test_too_few_shapes() -> None:
     with pytest.raises(ValueError, match="2 shapes cannot be split into training, 1 for validation and 1 for test"):
-        split(["a", "b"], 2, val=0.1, test=0.1, seed=0)
+        split_shapes(["a", "b"], 2, val=0.1, test=0.1, seed=0)
 
 
 def test_no_handle_crosses_processes(file: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from pnu.networks import build_network, checkpoints
-from pnu.networks.checkpoints import read
+from pnu.networks.checkpoints import read_checkpoint
 from tests.test_cli import small  # noqa: F401  a fixture
 
 PNU = {"_target_": "pnu.networks.pnu.PNU", "ratio": 2, "local_features": False}
@@ -24,7 +24,7 @@ from pnu.data import patch_file, shapes
 from pnu.networks import checkpoints
 state = {"x": torch.zeros(100_000)}
 writers = {
-    "c.ckpt": lambda path: checkpoints.write(path, {"state_dict": state}),
+    "c.ckpt": lambda path: checkpoints.write_checkpoint(path, {"state_dict": state}),
     "w.safetensors": lambda path: weights.write(path, {}, state),
     "p.h5": lambda path: patch_file.cut_patch_file(path, {"mug": functools.partial(shapes.make, "mug")}, 2),
     "run": lambda path: checkpoints.save(path, torch.nn.Linear(300, 300), {}, {}),
@@ -137,7 +137,7 @@ def test_training(disk: Path, small: list[str]) -> None:  # noqa: F811
     filler = fill(disk, 500_000)  # enough for all but a checkpoint
     resumed = ["-m", "pnu.train", "resume=true", "run=run", "trainer.max_steps=4", "quiet=true"]
     refused(command(disk, *resumed), "last.ckpt: cannot be written (No space left on device); free space or choose")
-    assert read(last)["global_step"] == 2
+    assert read_checkpoint(last)["global_step"] == 2
     assert '"status": "failed"' in (disk / "run/run.json").read_text()
     subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
     refused(command(disk, *resumed), "cannot be written to")
@@ -148,6 +148,6 @@ def test_training(disk: Path, small: list[str]) -> None:  # noqa: F811
     assert command(disk, *resumed).returncode == 0
     assert command(disk.parent, "-m", "pnu.train", *first, "run=run").returncode == 0
     assert command(disk.parent, *resumed).returncode == 0
-    ours, theirs = read(last), read(disk.parent / "run/checkpoints/last.ckpt")
+    ours, theirs = read_checkpoint(last), read_checkpoint(disk.parent / "run/checkpoints/last.ckpt")
     assert ours["global_step"] == 4
     assert all(torch.equal(ours["state_dict"][name], value) for name, value in theirs["state_dict"].items())

@@ -195,8 +195,8 @@ def test_summary_by_hand() -> None:
     assert math.isnan(summary["p2f"])  # a shape without a value must not vanish from the mean
     assert math.isnan(benchmark.summarize(rows[:1])[0]["chamfer_sq_std"])
     chamfer, p2f = benchmark.columns(rows)
-    assert result_tables.cell(summary, p2f) == "-"
-    assert result_tables.cell(summary, chamfer) == "4000.0000"
+    assert result_tables.row_cell(summary, p2f) == "-"
+    assert result_tables.row_cell(summary, chamfer) == "4000.0000"
 
 
 def test_cost_sees_memory_and_children() -> None:
@@ -218,11 +218,11 @@ def test_cost_sees_memory_and_children() -> None:
 
 def test_source_of_procedural_shapes() -> None:
     data = {"kinds": ["cad"], "val_share": 0.1, "test_share": 0.2}
-    parts = {part: benchmark.source(data, part=part).shapes for part in benchmark.PARTS}
+    parts = {part: benchmark.case_source(data, part=part).shapes for part in benchmark.PARTS}
     assert sorted(parts["train"] + parts["val"] + parts["test"]) == parts["all"] == shapes.names("cad")
-    found = benchmark.source(data)
+    found = benchmark.case_source(data)
     assert (found.name, found.shapes, found.kinds) == ("synthetic", parts["test"], list(benchmark.KINDS))
-    some = benchmark.source(data, ["random"], only=["wedge", "cup"], points=100, truth_points=200)
+    some = benchmark.case_source(data, ["random"], only=["wedge", "cup"], points=100, truth_points=200)
     assert [(case.truth.shape, len(case.points)) for case in some.cases] == [("wedge", 100), ("cup", 100)]
 
 
@@ -230,7 +230,7 @@ def test_source_of_a_folder_of_meshes(tmp_path: Path, box: Mesh) -> None:
     (tmp_path / "more").mkdir()
     write_mesh(tmp_path / "a.off", box)
     write_mesh(tmp_path / "more" / "b.stl", Mesh(box.vertices * 7, box.faces))
-    found = benchmark.source({"root": str(tmp_path)}, ["uniform"], points=64, truth_points=150)
+    found = benchmark.case_source({"root": str(tmp_path)}, ["uniform"], points=64, truth_points=150)
     assert (found.name, found.shapes) == (tmp_path.name, ["a", "more_b"])
     assert [case.truth.frame for case in found.cases] == ["as given, a unit sphere", "unit sphere of the truth"]
 
@@ -250,7 +250,7 @@ def test_source_of_a_folder_of_meshes(tmp_path: Path, box: Mesh) -> None:
 )
 def test_sources_refuse_at_once(data: dict, options: dict, text: str) -> None:
     with pytest.raises(ValueError, match=text):
-        benchmark.source(data, **options)
+        benchmark.case_source(data, **options)
 
 
 # Prepared pairs
@@ -269,7 +269,7 @@ def pairs(tmp_path: Path, box: Mesh) -> Path:
 
 
 def test_pairs_are_compared_in_the_unit_sphere_of_the_truth(pairs: Path) -> None:
-    found = benchmark.source({"root": str(pairs)}, truth_points=2000, warn=silent)
+    found = benchmark.case_source({"root": str(pairs)}, truth_points=2000, warn=silent)
     (case,) = found.cases
     assert (found.name, found.shapes, found.kinds, case.kind) == ("pairs", ["sink"], ["given"], "given")
     assert case.truth.mesh is not None
@@ -281,10 +281,10 @@ def test_pairs_are_compared_in_the_unit_sphere_of_the_truth(pairs: Path) -> None
 def test_pairs_with_samples_only_have_no_floor_and_no_p2f(pairs: Path, box: Mesh) -> None:
     even = sample_poisson_disk(box, 1000, np.random.default_rng(1))
     np.save(pairs / "truth" / "sink_1000.npy", np.hstack([40 * even[:, :3] + 1e4, even[:, 3:]]))
-    (case,) = benchmark.source({"root": str(pairs)}, truth_points=1000, warn=silent).cases
+    (case,) = benchmark.case_source({"root": str(pairs)}, truth_points=1000, warn=silent).cases
     assert len(case.truth.samples) == 1000
     (pairs / "truth" / "sink.ply").unlink()
-    (case,) = benchmark.source({"root": str(pairs)}).cases
+    (case,) = benchmark.case_source({"root": str(pairs)}).cases
     rows = list(benchmark.evaluate({}, [case], ratio=4))
     assert [row["method"] for row in rows] == ["input"]
     assert "p2f" not in rows[0]
@@ -297,7 +297,7 @@ def test_columns_of_pairs_as_text(pairs: Path, place: Path, capsys: pytest.Captu
     (pairs / "clouds" / "sink.xyz").unlink()
     np.savetxt(pairs / "clouds" / "sink.txt", np.hstack([normals, np.ones((len(points), 1)), points]))
     columns = "nx,ny,nz,_,x,y,z"
-    found = benchmark.source({"root": str(pairs)}, truth_points=500, columns=columns, warn=silent)
+    found = benchmark.case_source({"root": str(pairs)}, truth_points=500, columns=columns, warn=silent)
     (case,) = found.cases
     assert case.normals is not None
     np.testing.assert_allclose(case.normals, normals, atol=1e-9)
@@ -306,11 +306,11 @@ def test_columns_of_pairs_as_text(pairs: Path, place: Path, capsys: pytest.Captu
     assert capsys.readouterr().out.endswith(f"""data.root={pairs} 'columns="{columns}"'\n""")
     for wrong, text in {"x,y": "columns=x,y: expected x, y and z", "3": "columns=3: expected x, y and z"}.items():
         with pytest.raises(ValueError, match=text):
-            benchmark.source({"root": str(pairs)}, columns=wrong)
+            benchmark.case_source({"root": str(pairs)}, columns=wrong)
     (pairs / "clouds" / "sink.txt").unlink()
     write_cloud(pairs / "clouds" / "sink.ply", points)
     with pytest.raises(ValueError, match=r"columns=x,y,z: is for text and arrays without .*/clouds has none"):
-        benchmark.source({"root": str(pairs)}, columns="x,y,z")
+        benchmark.case_source({"root": str(pairs)}, columns="x,y,z")
 
 
 def save_samples(pairs: Path, box: Mesh, *counts: int) -> None:
@@ -324,10 +324,10 @@ def test_of_several_samples_those_asked_for_are_taken(pairs: Path, box: Mesh) ->
     save_samples(pairs, box, 500, 2000, 900)  # by their names, 900 is the last
     np.save(pairs / "truth" / "sink_more.npy", np.zeros((5, 3)))  # no count
     for count in (500, 2000, 900):
-        (case,) = benchmark.source({"root": str(pairs)}, truth_points=count, warn=silent).cases
+        (case,) = benchmark.case_source({"root": str(pairs)}, truth_points=count, warn=silent).cases
         assert len(case.truth.samples) == count
     said: list[str] = []
-    (case,) = benchmark.source({"root": str(pairs)}, truth_points=1000, warn=said.append).cases
+    (case,) = benchmark.case_source({"root": str(pairs)}, truth_points=1000, warn=said.append).cases
     assert len(case.truth.samples) == 2000
     name = pairs / "truth" / "sink_2000.npy"
     assert said == [f"{name}: is compared with, since there is no sink_1000.npy (truth_points=1000)"]
@@ -345,7 +345,7 @@ def test_what_is_recorded_is_what_was_used(pairs: Path, box: Mesh, tmp_path: Pat
 def test_pairs_of_which_it_is_unclear_what_is_meant_are_refused(pairs: Path, box: Mesh) -> None:
     def refused(text: str) -> None:
         with pytest.raises(ValueError, match=text):
-            list(benchmark.source({"root": str(pairs)}, truth_points=500).cases)
+            list(benchmark.case_source({"root": str(pairs)}, truth_points=500).cases)
 
     np.save(pairs / "truth" / "sink_500.npy", sample_area(box, 499, np.random.default_rng(0))[:, :3])
     refused("sink_500.npy: holds 499 points, its name says another number; rename it")
@@ -365,22 +365,22 @@ def test_vertices_without_a_face_decide_no_frame(pairs: Path, box: Mesh) -> None
     write_mesh(pairs / "truth" / "sink.ply", mesh)
     write_cloud(pairs / "clouds" / "sink.xyz", sample_area(box, 500, np.random.default_rng(0))[:, :3] + 40)
     with pytest.raises(ValueError, match="is not in the frame of"):
-        list(benchmark.source({"root": str(pairs)}, truth_points=500, warn=silent).cases)
+        list(benchmark.case_source({"root": str(pairs)}, truth_points=500, warn=silent).cases)
 
 
 def test_pairs_in_different_frames_are_refused(pairs: Path, box: Mesh) -> None:
     write_mesh(pairs / "truth" / "sink.ply", box)
     with pytest.raises(ValueError, match=r"the truth of sink: is not in the frame of .*sink.xyz"):
-        list(benchmark.source({"root": str(pairs)}).cases)
+        list(benchmark.case_source({"root": str(pairs)}).cases)
     (pairs / "truth" / "sink.ply").unlink()
     np.save(pairs / "truth" / "sink_900.npy", sample_area(box, 900, np.random.default_rng(0)))
     with pytest.raises(ValueError, match="is not in the frame of"):
-        list(benchmark.source({"root": str(pairs)}).cases)
+        list(benchmark.case_source({"root": str(pairs)}).cases)
     (pairs / "truth" / "sink_900.npy").unlink()
     with pytest.raises(
         ValueError, match=r"truth: expected sink.ply, the true mesh of clouds/sink, or sink_<count>.npy"
     ):
-        list(benchmark.source({"root": str(pairs)}).cases)
+        list(benchmark.case_source({"root": str(pairs)}).cases)
 
 
 # The command

@@ -14,7 +14,7 @@ import pnu
 from pnu.commands.train import Train, main
 from pnu.config.compose import compose_config
 from pnu.config.help_text import help_text
-from pnu.networks.checkpoints import read
+from pnu.networks.checkpoints import read_checkpoint
 from tests.commands import refused
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
@@ -95,7 +95,7 @@ def test_an_own_loss_network_and_data_train_go_on_and_load(mylab: Path, capsys: 
     # a run folder allows nothing by itself
     assert "expected a class of pnu." in refused(capsys, main, ["run=own", "resume=true", "trainer.max_steps=4"])
     main(["run=own", "resume=true", "trainer.max_steps=4", "allow=[mylab]", "quiet=true"])
-    assert read(Path("own/checkpoints/last.ckpt"))["global_step"] == 4
+    assert read_checkpoint(Path("own/checkpoints/last.ckpt"))["global_step"] == 4
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ import pnu.losses
 from pnu import networks
 from pnu.fast import FORMS, accelerate, accelerated, cache, forms
 from pnu.fast.forms import through
-from pnu.fast.neighborhoods import Groups, distinct, single, whole
+from pnu.fast.neighborhoods import Neighborhoods, distinct, single, whole
 from pnu.losses import CompoundLoss
 from pnu.networks.layers import MLP, Abstraction, JoinedMLP, PooledMLP, Propagation
 from pnu.networks.norm import synchronize
@@ -38,7 +38,7 @@ def small_chunks(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def mlp(*widths: int, bias: bool = True) -> MLP:
     torch.manual_seed(0)
     network = MLP(widths, bias=bias).double()
-    for layer in forms.stacked(network):
+    for layer in forms.layers_of(network):
         nn.init.normal_(layer.norm.weight)
         nn.init.normal_(layer.norm.bias)
         nn.init.normal_(layer.norm.running_mean)
@@ -53,7 +53,7 @@ def neighbors(clouds: int, m: int, n: int, k: int) -> Tensor:
 
 
 def run(
-    network: MLP, x: Tensor, groups: Groups | None, projected: bool, gradient: Tensor | None = None
+    network: MLP, x: Tensor, groups: Neighborhoods | None, projected: bool, gradient: Tensor | None = None
 ) -> list[Tensor]:
     """Output, gradients of the input and of all parameters but biases, and all statistics after one step."""
     network, x = copy.deepcopy(network), x.clone().requires_grad_()
@@ -107,7 +107,7 @@ def test_differences_of_tables_equal_layers(monkeypatch: pytest.MonkeyPatch, tra
     table = torch.randn(150, 16, dtype=torch.float64, requires_grad=True)
     centers = torch.randn(120, 16, dtype=torch.float64, requires_grad=True)
 
-    def both(groups: Groups) -> list[Tensor]:
+    def both(groups: Neighborhoods) -> list[Tensor]:
         copied = copy.deepcopy(network)
         with torch.set_grad_enabled(training):
             output = through(copied, table, projected=True, groups=groups, centers=centers)
@@ -130,7 +130,7 @@ def test_differences_of_tables_equal_layers(monkeypatch: pytest.MonkeyPatch, tra
 def test_flat_batch_norm(monkeypatch: pytest.MonkeyPatch, gamma: float) -> None:
     """Scales near zero, whose ReLU bends far from the mean of the products."""
     network, x = mlp(5, 8, 6, 7), torch.randn(100, 5, dtype=torch.float64)
-    for layer in forms.stacked(network):
+    for layer in forms.layers_of(network):
         nn.init.constant_(layer.norm.weight[::2], gamma)
     found = run(network, x, None, False)
     monkeypatch.setattr(forms, "streamed", lambda *_: False)

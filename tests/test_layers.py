@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Collection, Iterable
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -107,6 +108,37 @@ def test_no_two_names_of_files_differ_by_an_ending_only() -> None:
     rooms = [path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name != "__pycache__"]
     assert alike([*inner, *rooms]) == []
     assert alike(["picture", "pictures", "render"]) == [{"picture", "pictures"}]
+
+
+PROTOCOLS = {  # names that are the same because the functions can stand for each other, or are started by their file
+    *("main", "ball_query", "closest_points", "farthest_points", "knn"),
+}
+
+
+def public(path: Path) -> set[str]:
+    """Public functions and classes of a file; without the function of a verb, and without the fast form of a class,
+    which is a subclass of the same name."""
+    names = set()
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.FunctionDef) and not (path.parent.name == "commands" and node.name == path.stem):
+            names.add(node.name)
+        if isinstance(node, ast.ClassDef) and node.name not in {
+            ast.unparse(base).split(".")[-1] for base in node.bases
+        }:
+            names.add(node.name)
+    return {name for name in names if not name.startswith("_")}
+
+
+def defined_twice(paths: Iterable[Path]) -> set[str]:
+    count = Counter(name for path in paths for name in public(path))
+    return {name for name, number in count.items() if number > 1}
+
+
+def test_a_public_name_is_defined_in_one_file(tmp_path: Path) -> None:
+    assert defined_twice(PACKAGE.rglob("*.py")) == PROTOCOLS
+    copy = tmp_path / "copy.py"
+    copy.write_text("def closing_lines(): ...\n")
+    assert "closing_lines" in defined_twice([*PACKAGE.rglob("*.py"), copy])
 
 
 def undocumented(path: Path) -> list[str]:

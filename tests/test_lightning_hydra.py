@@ -24,7 +24,7 @@ from pnu.commands.train import Train, main
 from pnu.config.compose import compose_config
 from pnu.config.instantiate import GIVEN
 from pnu.config.schema import class_arguments
-from pnu.networks.checkpoints import read
+from pnu.networks.checkpoints import read_checkpoint
 from tests.commands import refused
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "lightning_hydra.md"
@@ -77,7 +77,7 @@ def record(run: Path) -> dict[str, Any]:
 
 
 def steps(run: Path) -> int:
-    return read(run / "checkpoints" / "last.ckpt")["global_step"]
+    return read_checkpoint(run / "checkpoints" / "last.ckpt")["global_step"]
 
 
 # --- the lines of the table that run ---
@@ -167,17 +167,17 @@ def test_the_average_of_the_weights_is_validated_and_kept_as_the_best(train: Any
     options = ["optimizer=sgd", "scheduler=none", "callbacks.checkpoints.every_n_steps=1"]
     run = train(EMA, "callbacks.ema.decay=0.9", *options)
     plain = train(*options, run="plain")
-    last, best = (read(run / "checkpoints" / f"{name}.ckpt")["state_dict"] for name in ("last", "best"))
-    same = read(plain / "checkpoints/last.ckpt")["state_dict"]
+    last, best = (read_checkpoint(run / "checkpoints" / f"{name}.ckpt")["state_dict"] for name in ("last", "best"))
+    same = read_checkpoint(plain / "checkpoints/last.ckpt")["state_dict"]
     assert all(torch.equal(last[name], same[name]) for name in same)  # the training itself is as without
-    average = read(run / "checkpoints/last.ckpt")["callbacks"]["EMA"]
+    average = read_checkpoint(run / "checkpoints/last.ckpt")["callbacks"]["EMA"]
     assert average["step"] == 2
     assert all(torch.equal(best[f"model.{name}"], value) for name, value in average["average"].items())
     assert any(not torch.equal(best[name], last[name]) for name in last)
     # by hand: from w0, decay (1 + step) / (10 + step) at steps 1 and 2
     whole = train("trainer.max_steps=1", *options, run="first")
     name = next(name for name in same if name.endswith("weight"))
-    first = read(whole / "checkpoints/last.ckpt")["state_dict"][name]
+    first = read_checkpoint(whole / "checkpoints/last.ckpt")["state_dict"][name]
     torch.manual_seed(0)
     start = initial(plain)[name.removeprefix("model.")]
     one = start.lerp(start, 0)  # the average begins with the weights before the first step
@@ -202,7 +202,7 @@ def test_a_run_with_an_average_goes_on_as_if_never_stopped(train: Any) -> None:
     run = train(EMA)
     main([f"run={run}", "resume=true", "trainer.max_epochs=2", "quiet=true"])
     for name in ("last", "best"):
-        ours, theirs = (read(one / "checkpoints" / f"{name}.ckpt")["state_dict"] for one in (run, whole))
+        ours, theirs = (read_checkpoint(one / "checkpoints" / f"{name}.ckpt")["state_dict"] for one in (run, whole))
         assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnu.commands.upsample import main, sampled
+from pnu.commands.upsample import _sampled, main
 from pnu.io import CLOUD_SUFFIXES, OUTPUT_SUFFIXES, Mesh, check_output, read_cloud, read_mesh, write_mesh
 from tests.commands import refused
 from tests.test_io import CUBE, volume
@@ -106,7 +106,7 @@ def test_points_on_the_faces(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     dense = read_cloud(output)
     assert len(dense.points) == 200
     assert np.abs(np.abs(dense.points - 8).max(1) - 1).max() < 0.3  # near the cube's surface
-    cloud = sampled(str(path), 100, True, 0)
+    cloud = _sampled(str(path), 100, True, 0)
     assert np.abs(np.abs(cloud.points - 8).max(1) - 1).max() < 1e-6
     assert ((cloud.points - 8) * cloud.normals).sum(1).min() > 0.9
     for text, sample, name in (("sample=3: expected at least 16", 3, path), ("is no mesh", 50, tmp_path / "c.xyz")):

@@ -128,7 +128,7 @@ PLACES = {
     "commands/compare.py upsamplers": "test_a_name_that_is_taken",
     "training/run_folder.py recorded": "test_a_run_that_was_stopped",
     "training/resuming.py open_run": "test_a_finished_run_that_lost_its_last_checkpoint",
-    "training/sweeps.py closing": "test_a_sweep_then_its_report",
+    "training/sweeps.py closing_line": "test_a_sweep_then_its_report",
     "training/sweeps.py run": "test_interrupted_with_a_launcher",  # in test_sweep.py
     "commands/_entry.py main": "test_interrupted_before_anything_is_made",
     "commands/_entry.py folder_arguments": "test_hydras_folder_is_the_run_folder",  # in test_train.py
@@ -282,7 +282,7 @@ def test_a_sweep_then_its_report(say: Say, trained: str) -> None:
     folder = Path(in_nasty("sweep"))
     folder.mkdir()
     Path(in_nasty("run")).rename(folder / "default_1")
-    closing = sweeps.closing(folder)
+    closing = sweeps.closing_line(folder)
     report = say(printed(closing))
     (tensorboard,) = re.findall("curves: (.*)", report)
     assert words(tensorboard) == ["tensorboard", "--logdir", str(folder)]
@@ -292,7 +292,7 @@ def test_a_sweep_then_its_report(say: Say, trained: str) -> None:
     assert words(typed_before)[:3] == ["pnu", "train", "data=patches"]
     write_json(folder / "default_1" / "run.json", {"status": "failed"})
     with typed("train", ["-m", "seed=0,1"]):
-        assert printed(sweeps.closing(folder)) == "pnu train -m seed=0,1"  # nothing to report on
+        assert printed(sweeps.closing_line(folder)) == "pnu train -m seed=0,1"  # nothing to report on
 
 
 def test_interrupted_before_anything_is_made(

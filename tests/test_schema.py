@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from pnu.commands.train import Train
 from pnu.config.compose import compose_config, composer, config_folder
 from pnu.config.help_text import help_text, reference, written
-from pnu.config.schema import class_arguments, convert, library, settable, targets, type_name
+from pnu.config.schema import as_type, class_arguments, library, settable, targets, type_name
 from pnu.config.signature import REQUIRED, Class, arguments, described, summary
 
 GROUPS = ("callbacks", "data", "logger", "loss", "model", "optimizer", "scheduler", "trainer")
@@ -137,7 +137,7 @@ def test_described_ends_with_the_section() -> None:
     ],
 )  # fmt: skip
 def test_values_become_what_is_meant(value: object, hint: Any, right: object) -> None:
-    found = convert(value, hint)
+    found = as_type(value, hint)
     assert found == right
     assert type(found) is type(right)
 
@@ -151,7 +151,7 @@ def test_values_become_what_is_meant(value: object, hint: Any, right: object) ->
 )  # fmt: skip
 def test_values_of_another_type_are_refused(value: object, hint: Any) -> None:
     with pytest.raises(TypeError):
-        convert(value, hint)
+        as_type(value, hint)
 
 
 # --- conf/ ---

@@ -19,7 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from pnu.data import patch_file, shapes
 from pnu.io import read_cloud, write_mesh
-from pnu.networks.checkpoints import read
+from pnu.networks.checkpoints import read_checkpoint
 from tests.test_cli import small  # noqa: F401  a fixture
 
 pytestmark = pytest.mark.slow
@@ -93,7 +93,7 @@ def check_whole(run: Path) -> int:
         json.loads(path.read_text())
     if (run / "config.yaml").exists():
         assert "model" in yaml.safe_load((run / "config.yaml").read_text())
-    steps = [read(path)["global_step"] for path in sorted(run.glob("checkpoints/[!.]*.ckpt"))]
+    steps = [read_checkpoint(path)["global_step"] for path in sorted(run.glob("checkpoints/[!.]*.ckpt"))]
     return steps[-1] if (run / "checkpoints/last.ckpt").exists() else 0
 
 
@@ -139,7 +139,7 @@ def test_training(tmp_path: Path, small: list[str]) -> None:  # noqa: F811
     finish(tmp_path, "train", *options, f"run={tmp_path / 'whole'}")
     assert not [path for path in run.rglob(".*")], "a temporary file was left"
     for name in ("last", "best"):
-        ours, theirs = (read(tmp_path / side / f"checkpoints/{name}.ckpt") for side in ("killed", "whole"))
+        ours, theirs = (read_checkpoint(tmp_path / side / f"checkpoints/{name}.ckpt") for side in ("killed", "whole"))
         assert equal({key: ours.get(key) for key in KEPT}, {key: theirs.get(key) for key in KEPT}), name
     assert ours["global_step"] > 0
     assert (run / "metrics.json").read_text() == (tmp_path / "whole/metrics.json").read_text()
@@ -224,5 +224,7 @@ def test_sweep(tmp_path: Path, small: list[str]) -> None:  # noqa: F811
     ]
     assert len(sweeps[0]) == len(sweeps[1]) == 2
     for ours, theirs in zip(*sweeps, strict=True):
-        assert equal({key: read(ours)[key] for key in KEPT}, {key: read(theirs)[key] for key in KEPT})
+        assert equal(
+            {key: read_checkpoint(ours)[key] for key in KEPT}, {key: read_checkpoint(theirs)[key] for key in KEPT}
+        )
         assert json.loads((ours.parents[1] / "run.json").read_text())["status"] == "finished"

@@ -246,6 +246,6 @@ def test_vertex_normals() -> None:
 def test_interpolate() -> None:
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [9, 9, 9]])
     values = np.arange(10.0).reshape(5, 2)
-    np.testing.assert_allclose(reconstruction.interpolate(points, values, points), values, atol=1e-6)
-    middle = reconstruction.interpolate(points, values, np.array([[0.5, 0, 0]]), k=2)
+    np.testing.assert_allclose(reconstruction.interpolated_values(points, values, points), values, atol=1e-6)
+    middle = reconstruction.interpolated_values(points, values, np.array([[0.5, 0, 0]]), k=2)
     np.testing.assert_allclose(middle, [[1, 2]], atol=1e-6)

@@ -19,7 +19,7 @@ from pnu.config.compose import compose_config, composer, config_folder
 from pnu.config.schema import checked_config
 from pnu.io import read_json, write_json
 from pnu.training.run_folder import RunFolder
-from pnu.training.sweeps import arguments, check_job, label_of, sweep_name
+from pnu.training.sweeps import check_job, label_of, sweep_arguments, sweep_name
 from tests.test_train import patch_file  # noqa: F401  a fixture
 
 ABLATIONS = sorted(path.stem for path in (config_folder() / "ablation").glob("*.yaml"))
@@ -135,7 +135,7 @@ def test_the_same_command_is_the_same_sweep() -> None:
     assert name == sweep_name([*reversed(line), "quiet=true", "hydra/launcher=joblib"], "train")
     assert name != sweep_name([*line, "trainer.max_steps=3"], "train")
     assert sweep_name(["loss.w3=0,1"], "train").startswith("train_")
-    assert not any(argument.startswith("sweep=") for argument in arguments([*line, "sweep=mine"], "train"))
+    assert not any(argument.startswith("sweep=") for argument in sweep_arguments([*line, "sweep=mine"], "train"))
 
 
 def test_labels_are_short() -> None:
@@ -378,7 +378,7 @@ def test_interrupted_with_submitit(whom: str, patch_file: Path, tmp_path: Path) 
 
 
 def test_a_job_whose_process_is_gone_does_not_run(tmp_path: Path) -> None:
-    from pnu.training.sweeps import closing, locked, record_interruptions, state
+    from pnu.training.sweeps import closing_line, locked, record_interruptions, state
 
     run = RunFolder(tmp_path / "default_1")
     run.path.mkdir()
@@ -389,7 +389,7 @@ def test_a_job_whose_process_is_gone_does_not_run(tmp_path: Path) -> None:
     assert run.read_record()["status"] == "running"
     os.close(lock)
     assert state(run) == "interrupted"
-    assert "(1 interrupted)" in closing(tmp_path)
+    assert "(1 interrupted)" in closing_line(tmp_path)
     record_interruptions(tmp_path)
     assert (run.read_record()["status"], run.read_record()["error"]) == ("failed", "interrupted")
     write_json(run.record_path, {"status": "running", "host": "elsewhere"})
@@ -465,7 +465,7 @@ def test_what_is_left_of_a_search(tmp_path: Path) -> None:
     import optuna
     from omegaconf import OmegaConf
 
-    from pnu.training.optuna_search import arguments
+    from pnu.training.optuna_search import search_arguments
 
     storage = f"sqlite:///{tmp_path}/optuna.db"
     sweeper = {
@@ -476,7 +476,7 @@ def test_what_is_left_of_a_search(tmp_path: Path) -> None:
         "sampler": {"seed": 7},
     }
     hydra = OmegaConf.create({"sweeper": sweeper})
-    assert arguments(hydra) == [], "nothing has begun"
+    assert search_arguments(hydra) == [], "nothing has begun"
     study = optuna.create_study(storage=storage, study_name="s")
     for value in (1.0, 2.0):
         trial = study.ask()
@@ -484,11 +484,11 @@ def test_what_is_left_of_a_search(tmp_path: Path) -> None:
         study.tell(trial, value)
     lost = study.ask()
     lost.suggest_float("lr", 0, 1)
-    assert arguments(hydra) == ["hydra.sweeper.n_trials=3", "hydra.sweeper.sampler.seed=9"]
+    assert search_arguments(hydra) == ["hydra.sweeper.n_trials=3", "hydra.sweeper.sampler.seed=9"]
     study = optuna.load_study(storage=storage, study_name="s")
     assert study.trials[2].state == optuna.trial.TrialState.FAIL
     assert study.ask().suggest_float("lr", 0, 1) == lost.params["lr"]
-    assert arguments(OmegaConf.create({"sweeper": {"_target_": "BasicSweeper"}})) == []
+    assert search_arguments(OmegaConf.create({"sweeper": {"_target_": "BasicSweeper"}})) == []
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from pnu.geometry import sampling
 from pnu.geometry.farthest_blocks import farthest_in_blocks
 from pnu.geometry.sampling import farthest_points_large
-from pnu.geometry.spatial_blocks import along_curve, split
+from pnu.geometry.spatial_blocks import along_curve, split_blocks
 
 SIZE = 2**12  # of a block
 
@@ -31,7 +31,7 @@ def spacing(chosen: np.ndarray) -> np.ndarray:
 def at_border(points: np.ndarray, chosen: np.ndarray, width: float) -> np.ndarray:
     """Which of the chosen points have points of another block within `width`."""
     owner = np.empty(len(points), int)
-    for number, members in enumerate(split(points, SIZE).members):
+    for number, members in enumerate(split_blocks(points, SIZE).members):
         owner[members] = number
     near = cKDTree(points).query_ball_point(points[chosen], width)
     return np.array([len(set(owner[idx].tolist())) > 1 for idx in near])
@@ -59,7 +59,7 @@ def test_borders_are_as_even_as_the_inside(share: float) -> None:
 
 def test_a_joint_of_independent_blocks_would_be_seen() -> None:
     points = sphere(60_000)
-    parts = [members[choose(points[members], len(members) // 4)] for members in split(points, SIZE).members]
+    parts = [members[choose(points[members], len(members) // 4)] for members in split_blocks(points, SIZE).members]
     chosen = np.concatenate(parts)
     found = spacing(points[chosen])[:, 0]
     edge = at_border(points, chosen, np.median(found))
@@ -115,7 +115,7 @@ def test_the_way_is_told() -> None:
     farthest_in_blocks(points, 5000, choose, size=SIZE, threads=2, step=lambda *step: steps.append(step))
     done, totals = zip(*steps, strict=True)
     assert list(done) == list(range(len(done)))
-    assert done[-1] == totals[-1] >= 2 * len(split(points, SIZE).members)
+    assert done[-1] == totals[-1] >= 2 * len(split_blocks(points, SIZE).members)
     assert list(totals) == sorted(totals)
 
 

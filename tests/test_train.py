@@ -20,7 +20,7 @@ from torch import Tensor
 import pnu
 from pnu.commands.train import main
 from pnu.config.compose import config_folder
-from pnu.networks.checkpoints import newest_run, read
+from pnu.networks.checkpoints import newest_run, read_checkpoint
 from pnu.training import callbacks
 from pnu.training.sweeps import locked
 from tests.commands import refused
@@ -64,7 +64,7 @@ def resume(run: Path, *overrides: str) -> None:
 
 
 def weights(run: Path, name: str = "last") -> dict[str, Tensor]:
-    return read(run / "checkpoints" / f"{name}.ckpt")["state_dict"]
+    return read_checkpoint(run / "checkpoints" / f"{name}.ckpt")["state_dict"]
 
 
 def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
@@ -320,7 +320,8 @@ def test_a_run_goes_on_from_every_checkpoint_as_if_never_stopped(
         assert same(weights(copy), weights(whole)), copy
         assert same(weights(copy, "best"), weights(whole, "best")), copy
         assert (
-            read(copy / "checkpoints/last.ckpt")["global_step"] == read(whole / "checkpoints/last.ckpt")["global_step"]
+            read_checkpoint(copy / "checkpoints/last.ckpt")["global_step"]
+            == read_checkpoint(whole / "checkpoints/last.ckpt")["global_step"]
         )
         assert (copy / "metrics.json").read_text() == (whole / "metrics.json").read_text()
         for name in ("train/loss", "train/lr", "val/chamfer_sq"):
@@ -332,7 +333,7 @@ def test_a_finished_run_can_be_made_longer(train: Train) -> None:
     run = train("trainer.max_epochs=1")
     before = record(run)
     resume(run, "trainer.max_epochs=2")
-    assert read(run / "checkpoints/last.ckpt")["global_step"] == 8
+    assert read_checkpoint(run / "checkpoints/last.ckpt")["global_step"] == 8
     assert same(weights(run), weights(train("trainer.max_epochs=2", run="whole")))
     assert record(run)["started"] == before["started"]
     assert len(record(run)["resumed"]) == 1
@@ -387,7 +388,7 @@ def test_a_run_of_an_older_version_goes_on(train: Train) -> None:
     del config["objective"], config["threads"]  # keys that came later
     (run / "config.yaml").write_text(yaml.safe_dump(config))
     resume(run, "trainer.max_epochs=2")
-    assert read(run / "checkpoints/last.ckpt")["global_step"] == 8
+    assert read_checkpoint(run / "checkpoints/last.ckpt")["global_step"] == 8
     assert yaml.safe_load((run / "config.yaml").read_text())["objective"] is None
 
 
@@ -529,7 +530,7 @@ CHOICES = [
 def test_every_choice_trains_a_step(train: Train, choice: str) -> None:
     run = train(choice, "trainer.max_steps=1", "trainer.max_epochs=1", "data.batch_size=2")
     assert record(run)["status"] == "finished"
-    assert read(run / "checkpoints/last.ckpt")["global_step"] == 1
+    assert read_checkpoint(run / "checkpoints/last.ckpt")["global_step"] == 1
 
 
 def test_onecycle_without_warm_up(train: Train) -> None:
@@ -543,7 +544,7 @@ def test_early_stopping_stops(train: Train) -> None:
     stopping = "callbacks.early_stopping"
     options = ["callbacks=[default,early_stopping]", f"{stopping}.patience=1", f"{stopping}.min_delta=9"]
     run = train(*options, "trainer.max_epochs=9")
-    assert read(run / "checkpoints/last.ckpt")["global_step"] < 36
+    assert read_checkpoint(run / "checkpoints/last.ckpt")["global_step"] < 36
 
 
 def test_deterministic_mode_gives_the_same_bits(train: Train) -> None:

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from pnu import weights
-from pnu.benchmark import source
+from pnu.benchmark import case_source
 from pnu.benchmark.trained_shapes import Trained, of_card, trained_on
 from pnu.commands.compare import main, upsamplers
 from pnu.data import shapes
@@ -25,7 +25,7 @@ def run(folder: Path, data: dict, **more: object) -> Path:
 
 def test_a_run_on_procedural_shapes_has_seen_those_that_are_not_kept(tmp_path: Path) -> None:
     trained = trained_on(run(tmp_path / "run", SYNTHETIC))
-    parts = {part: source(SYNTHETIC, part=part).shapes for part in ("train", "val", "test")}
+    parts = {part: case_source(SYNTHETIC, part=part).shapes for part in ("train", "val", "test")}
     assert trained.of(parts["train"], True) == parts["train"]
     assert trained.of(parts["val"] + parts["test"], True) == []
     assert trained.of(parts["train"], False) == []  # meshes of such names are others
@@ -48,7 +48,7 @@ def test_a_run_on_meshes_and_what_it_began_with(tmp_path: Path) -> None:
 
 
 def test_every_card_says_what_it_was_trained_on() -> None:
-    for name in weights.names():
+    for name in weights.shipped_names():
         trained = trained_on(name)
         assert len(trained.procedural) > 60, name
         assert trained.procedural <= set(shapes.names())

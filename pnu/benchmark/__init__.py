@@ -1,6 +1,6 @@
 """Whole clouds measured against true surfaces: inputs of several kinds, any upsamplers, tables."""
 
-from pnu.benchmark.case_sources import PARTS, Source, source
+from pnu.benchmark.case_sources import PARTS, CaseSource, case_source
 from pnu.benchmark.cases import KINDS, Case, Truth, mesh_cases, pair_cases, truth_of_mesh
 from pnu.benchmark.measuring import Method, Row, evaluate, measure, network_upsampler
 from pnu.benchmark.result_tables import columns, legend, print_tables, result_folder, summarize, write_results
@@ -9,10 +9,11 @@ __all__ = [
     "KINDS",
     "PARTS",
     "Case",
+    "CaseSource",
     "Method",
     "Row",
-    "Source",
     "Truth",
+    "case_source",
     "columns",
     "evaluate",
     "legend",
@@ -22,7 +23,6 @@ __all__ = [
     "pair_cases",
     "print_tables",
     "result_folder",
-    "source",
     "summarize",
     "truth_of_mesh",
     "write_results",

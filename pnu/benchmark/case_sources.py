@@ -7,14 +7,14 @@ from typing import Any, NamedTuple
 
 from pnu.benchmark.cases import KINDS, Case, Warn, is_pairs_folder, mesh_cases, pair_cases, pair_files
 from pnu.data import shapes
-from pnu.data.patch_dataset import split
+from pnu.data.patch_dataset import split_shapes
 from pnu.io import Mesh, meshes_of, read_mesh
 from pnu.io.cloud import columns_of
 
 PARTS = ("train", "val", "test", "all")
 
 
-class Source(NamedTuple):
+class CaseSource(NamedTuple):
     """Where cases come from."""
 
     name: str
@@ -23,7 +23,7 @@ class Source(NamedTuple):
     cases: Iterator[Case]
 
 
-def source(
+def case_source(
     data: Mapping[str, Any],
     kinds: Sequence[str] = KINDS,
     *,
@@ -35,7 +35,7 @@ def source(
     normals: bool = True,
     columns: str | None = None,
     warn: Warn = print,
-) -> Source:
+) -> CaseSource:
     """Cases of `data`, drawn as they are asked for; what is wrong with the arguments is said at once.
 
     Args:
@@ -62,9 +62,9 @@ def source(
     if data.get("root") and is_pairs_folder(data["root"]):
         root = Path(data["root"])
         paths = pair_files(root)
-        names = chosen([path.stem for path in paths], data, part or "all", only)
+        names = chosen_names([path.stem for path in paths], data, part or "all", only)
         columns_of([path for path in paths if path.stem in names], columns, f"{root}/clouds")
-        return Source(root.resolve().name, names, ["given"], pair_cases(root, names, columns=columns, **options))
+        return CaseSource(root.resolve().name, names, ["given"], pair_cases(root, names, columns=columns, **options))
     if columns is not None:
         raise ValueError(f"columns={columns}: is for prepared pairs, data=meshes data.root=FOLDER with clouds/, truth/")
     makers: dict[str, Callable[[], Mesh]]
@@ -79,12 +79,12 @@ def source(
             "data: evaluation takes whole shapes: data=synthetic, or data=meshes data.root=FOLDER, a folder of meshes "
             "or one with clouds/ and truth/"
         )
-    names = chosen(list(makers), data, part, only)
+    names = chosen_names(list(makers), data, part, only)
     makers = {shape: makers[shape] for shape in names}
-    return Source(name, names, list(kinds), mesh_cases(makers, kinds, points=points, **options))
+    return CaseSource(name, names, list(kinds), mesh_cases(makers, kinds, points=points, **options))
 
 
-def chosen(names: list[str], data: Mapping[str, Any], part: str, only: Sequence[str] | None) -> list[str]:
+def chosen_names(names: list[str], data: Mapping[str, Any], part: str, only: Sequence[str] | None) -> list[str]:
     """The names of a part, or of `only`."""
     if only:
         if missing := [name for name in only if name not in names]:
@@ -94,4 +94,4 @@ def chosen(names: list[str], data: Mapping[str, Any], part: str, only: Sequence[
         return names
     shares = {"val": float(data.get("val_share", 0.1)), "test": float(data.get("test_share", 0.1))}
     names = sorted(names)
-    return [names[row] for row in split(names, len(names), **shares, seed=0)[part]]
+    return [names[row] for row in split_shapes(names, len(names), **shares, seed=0)[part]]

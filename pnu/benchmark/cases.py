@@ -122,7 +122,7 @@ def pair_cases(
         for note in notes:
             warn(f"{path}: {note}")
         points = moved(points, frame)
-        check_frame(points, truth, path)
+        check_pair(points, truth, path)
         yield Case("given", points, given, truth)
 
 
@@ -169,7 +169,7 @@ def named_count(path: Path) -> int | None:
     return int(digits) if digits.isdecimal() else None
 
 
-def check_frame(points: np.ndarray, truth: Truth, path: Path) -> None:
+def check_pair(points: np.ndarray, truth: Truth, path: Path) -> None:
     """ValueError if the cloud does not lie on the truth: another frame, unit or shape."""
     mesh = truth.mesh
     if mesh is None:  # a triangle at each sample is surface enough for this

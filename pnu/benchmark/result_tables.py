@@ -76,10 +76,12 @@ def print_tables(rows: Sequence[Row], head: str, metrics: Sequence[Metric] = MET
             if method not in REFERENCES:
                 for row in of_kind:
                     if row["method"] == method:
-                        table.add_row(method, row["shape"], *(cell(row, shown) for shown in all_shown))
-            table.add_row(method, "mean", *(cell(summary, shown) for shown in all_shown), style="bold")
+                        table.add_row(method, row["shape"], *(row_cell(row, shown) for shown in all_shown))
+            table.add_row(method, "mean", *(row_cell(summary, shown) for shown in all_shown), style="bold")
             spread = {shown.name: summary.get(f"{shown.name}_std") for shown in all_shown}
-            table.add_row("", "spread", *(cell(spread, shown) for shown in all_shown), style="dim", end_section=True)
+            table.add_row(
+                "", "spread", *(row_cell(spread, shown) for shown in all_shown), style="dim", end_section=True
+            )
         console.print(table)
     console.print(f"{head}. {legend(rows)}\n")
 
@@ -91,7 +93,7 @@ def counts(rows: Sequence[Row]) -> str:
     return ", ".join(f"{n} -> {m}" for n, m in pairs[:3]) + (" ..." if len(pairs) > 3 else "") + " points"
 
 
-def cell(row: Mapping[str, Any], shown: Shown) -> str:
+def row_cell(row: Mapping[str, Any], shown: Shown) -> str:
     """A value of a row as its table shows it."""
     return shown.text(row.get(shown.name))
 
@@ -106,11 +108,17 @@ def write_results(
         writer = csv.DictWriter(file, names)
         writer.writeheader()
         writer.writerows(rows)
-    content = {**head, **counted(rows), "legend": legend(rows), "rows": list(rows), "summary": summarize(rows, metrics)}
+    content = {
+        **head,
+        **used_points(rows),
+        "legend": legend(rows),
+        "rows": list(rows),
+        "summary": summarize(rows, metrics),
+    }
     write_json(folder / "metrics.json", content)
 
 
-def counted(rows: Iterable[Row]) -> dict[str, Any]:
+def used_points(rows: Iterable[Row]) -> dict[str, Any]:
     """The numbers of points that were used, whatever was asked for: one, or all of them where they differ."""
     found: dict[str, Any] = {}
     for name, values in (

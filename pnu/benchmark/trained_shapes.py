@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from pnu import weights
-from pnu.benchmark.case_sources import chosen
+from pnu.benchmark.case_sources import chosen_names
 from pnu.data import shapes
 from pnu.io import meshes_of
 
@@ -86,7 +86,7 @@ def of_data(data: Mapping[str, Any]) -> Trained:
         try:
             names = list(meshes_of(data["root"]))
             whole = "validation" in data  # keeps the meshes that are named, no share of them
-            meshes = frozenset(names if whole else chosen(names, data, "train", None))
+            meshes = frozenset(names if whole else chosen_names(names, data, "train", None))
         except ValueError:
             unknown = f"its meshes in {data['root']} are not here"
     elif data.get("path"):
@@ -96,4 +96,4 @@ def of_data(data: Mapping[str, Any]) -> Trained:
 
 def procedural_part(data: Mapping[str, Any], part: str) -> list[str]:
     """The procedural shapes of a part, as training splits them."""
-    return chosen(shapes.names(*(data.get("kinds") or ())), data, part, None)
+    return chosen_names(shapes.names(*(data.get("kinds") or ())), data, part, None)

@@ -123,7 +123,7 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
                 if not parsed.multirun:
                     check_single(overrides)
                 if goes_on:
-                    added = sweeps.arguments(overrides, name)
+                    added = sweeps.sweep_arguments(overrides, name)
                     arguments += added
                     parsed.overrides += added
                     overrides += [o for o in added if not o.startswith("hydra.")]
@@ -147,7 +147,7 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
                 if goes_on:
                     hydra_config = compose([*next(variations(overrides)), *hydras_own(parsed.overrides)], True).hydra
                     Path(hydra_config.sweep.dir).mkdir(parents=True, exist_ok=True)
-                    arguments += optuna_search.arguments(hydra_config)
+                    arguments += optuna_search.search_arguments(hydra_config)
                 elif not parsed.multirun and not parsed.cfg:
                     arguments += folder_arguments(compose([*overrides, *hydras_own(parsed.overrides)], True), schema)
         except (ValueError, OSError) as error:
@@ -231,6 +231,11 @@ def stop(error: Exception) -> typing.NoReturn:
         sys.exit(1)
     print(f"error: {one_line(error)}", file=sys.stderr)
     sys.exit(2)
+
+
+def warn(text: str) -> None:
+    """A line on stderr."""
+    print(f"warning: {text}", file=sys.stderr)
 
 
 def full_errors() -> bool:

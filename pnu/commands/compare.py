@@ -1,13 +1,12 @@
 """Compare trained networks and classical methods on one page: `pnu compare methods=[FOLDER,apss]`."""
 
 import functools
-import sys
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from pnu.commands._entry import command
+from pnu.commands._entry import command, warn
 from pnu.config.instantiate import find_metric
 from pnu.config.quoting import quoted, typed_line
 from pnu.config.schema import Group, doc
@@ -15,7 +14,7 @@ from pnu.runtime.progress import steps
 from pnu.runtime.provenance import provenance
 
 if TYPE_CHECKING:
-    from pnu.benchmark import Case, Method, Source
+    from pnu.benchmark import Case, CaseSource, Method
 
 
 @dataclass
@@ -61,13 +60,13 @@ class Compare:
 
 def compare(cfg: Any) -> None:
     """Run the methods on the shapes and write the page."""
-    check_options(cfg)
+    _check_options(cfg)
     from pnu import benchmark, metrics
     from pnu.report import comparison_page
     from pnu.training.run_folder import versions
 
     chosen = metrics.with_own(cfg.metrics, functools.partial(find_metric, allow=cfg.allow))
-    source = benchmark.source(
+    source = benchmark.case_source(
         cfg.data, cfg.kinds, part=cfg.part, only=cfg.shapes, points=cfg.points, truth_points=cfg.truth_points,
         seed=cfg.seed, normals=cfg.normals == "given", columns=cfg.columns, warn=warn,
     )  # fmt: skip
@@ -79,11 +78,11 @@ def compare(cfg: Any) -> None:
     for text in seen:
         warn(text)
     output = benchmark.result_folder(cfg.output or Path("outputs", "comparison", source.name))
-    shown: dict[tuple[str, str], comparison_page.Shown] = {}
+    shown: dict[tuple[str, str], comparison_page.ShownCase] = {}
 
     def keep(case: "Case", method: str, cloud: Any) -> None:
         if case.truth.shape in source.shapes[: cfg.shown]:
-            one = shown.setdefault((case.truth.shape, case.kind), comparison_page.Shown.of(case))
+            one = shown.setdefault((case.truth.shape, case.kind), comparison_page.ShownCase.of(case))
             one.clouds[method] = cloud.astype("float32")
 
     with steps(len(source.shapes) * len(source.kinds) * (len(methods) + 1), cfg.quiet) as step:
@@ -138,7 +137,7 @@ def upsamplers(cfg: Any) -> dict[str, "Method"]:
         elif weights.find(folder):
             model, name = checkpoints.load(folder, cfg.allow), name or Path(folder).stem
         else:
-            known = ", ".join([*CLASSICAL, *weights.names()])
+            known = ", ".join([*CLASSICAL, *weights.shipped_names()])
             raise ValueError(f"methods={method}: expected a run folder, or one of {known}; found neither")
         if name in found or name in ("input", "floor", "truth"):
             cure = quoted("methods", [f"NAME:{folder}"])
@@ -155,7 +154,7 @@ def upsamplers(cfg: Any) -> dict[str, "Method"]:
     return found
 
 
-def seen_in_training(cfg: Any, source: "Source") -> list[str]:
+def seen_in_training(cfg: Any, source: "CaseSource") -> list[str]:
     """A line for each network that has seen some of the shapes in its training: those rows are no test of it."""
     from pnu.benchmark.trained_shapes import trained_on
     from pnu.upsamplers import CLASSICAL
@@ -186,7 +185,7 @@ def runs_of_sweep(method: str) -> list[str]:
     return [f"{run.path.name.rpartition('_')[0]}:{run.path}" for run in finished]
 
 
-def check_options(cfg: Any) -> None:
+def _check_options(cfg: Any) -> None:
     """Refuse what can be refused before anything is loaded."""
     from pnu.rendering.colors import COLORMAPS
 
@@ -200,11 +199,6 @@ def check_options(cfg: Any) -> None:
     for key, least, most in (("shown", 1, 1000), ("page_mb", 1, 1000), ("size", 64, 2048)):
         if not least <= cfg[key] <= most:
             raise ValueError(f"{key}={cfg[key]:g}: expected a number from {least} to {most}")
-
-
-def warn(text: str) -> None:
-    """A line on stderr."""
-    print(f"warning: {text}", file=sys.stderr)
 
 
 main = command(compare, Compare)

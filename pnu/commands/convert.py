@@ -32,7 +32,7 @@ def convert(cfg: Any) -> None:
     from pnu.networks.pnu import PNU
     from pnu.networks.released import from_released
 
-    content = checkpoints.read(cfg.input)
+    content = checkpoints.read_checkpoint(cfg.input)
     state = content.get("model_state_dict")
     if not isinstance(state, dict):
         raise ValueError(f"{cfg.input}: expected a dict with model_state_dict, as the released code saves, found none")

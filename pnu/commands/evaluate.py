@@ -1,12 +1,11 @@
 """Measure a trained network, or a classical method, on whole clouds: `pnu evaluate run=FOLDER`."""
 
 import functools
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pnu.commands._entry import command
+from pnu.commands._entry import command, warn
 from pnu.config.instantiate import find_metric
 from pnu.config.quoting import shell_line
 from pnu.config.schema import Group, doc
@@ -58,7 +57,7 @@ class Evaluate:
 
 def evaluate(cfg: Any) -> None:
     """Measure one method on the shapes; tables, and files in the run folder."""
-    check_options(cfg)
+    _check_options(cfg)
     from pnu import benchmark, io, metrics
     from pnu.geometry.mesh_sampling import closest_points
     from pnu.metrics import ray_casting
@@ -67,7 +66,7 @@ def evaluate(cfg: Any) -> None:
     from pnu.upsamplers import classical
 
     chosen = metrics.with_own(cfg.metrics, functools.partial(find_metric, allow=cfg.allow))
-    source = benchmark.source(
+    source = benchmark.case_source(
         cfg.data, cfg.kinds, part=cfg.part, only=cfg.shapes, points=cfg.points, truth_points=cfg.truth_points,
         seed=cfg.seed, normals=cfg.normals == "given", columns=cfg.columns, warn=warn,
     )  # fmt: skip
@@ -114,7 +113,7 @@ def evaluate(cfg: Any) -> None:
         print(f"next:   {shell_line('compare', methods=[subject, rival], **data)}")
 
 
-def check_options(cfg: Any) -> None:
+def _check_options(cfg: Any) -> None:
     """Refuse what can be refused before anything is loaded."""
     for key, known in (("normals", tuple(NORMALS)), ("search", ("exact", "open3d"))):
         if cfg[key] not in known:
@@ -123,11 +122,6 @@ def check_options(cfg: Any) -> None:
         raise ValueError(f"run={cfg.run} and method={cfg.method}: expected one of them; pnu.compare takes several")
     if not 1 <= cfg.ratio < float("inf"):
         raise ValueError(f"ratio={cfg.ratio:g}: expected a number >= 1, the points out for each point in")
-
-
-def warn(text: str) -> None:
-    """A line on stderr."""
-    print(f"warning: {text}", file=sys.stderr)
 
 
 main = command(evaluate, Evaluate)

@@ -43,7 +43,7 @@ def prepare(cfg: Any) -> None:
 
 def next_line(path: Path) -> str:
     """The training that a file of patches is fit for, or why it is fit for none."""
-    from pnu.data.patch_dataset import Options, split
+    from pnu.data.patch_dataset import Options, split_shapes
     from pnu.data.patch_file import check_patch_file
 
     contents, usual = check_patch_file(path), Options()
@@ -52,7 +52,7 @@ def next_line(path: Path) -> str:
     if points < 64:
         return f"no training: a patch needs 256 points or more, these have {contents.points}"
     try:
-        train = split(contents.names, contents.patches, val=0.1, test=0.1, seed=0)["train"]
+        train = split_shapes(contents.names, contents.patches, val=0.1, test=0.1, seed=0)["train"]
     except ValueError as error:
         return f"no training: {error}"
     options: dict[str, Any] = {"data.path": path}

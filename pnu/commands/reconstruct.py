@@ -1,13 +1,12 @@
 """Make a surface from a cloud with normals: `pnu reconstruct input=dense.ply output=mesh.ply`."""
 
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pnu.commands._entry import command
+from pnu.commands._entry import command, warn
 from pnu.config.quoting import shell_line
 from pnu.config.schema import doc
 from pnu.runtime.progress import busy
@@ -49,7 +48,7 @@ def reconstruct(cfg: Any) -> None:
 
     started = time.perf_counter()
     say: Callable[[str], None] = (lambda text: None) if cfg.quiet else print
-    check_options(cfg)
+    _check_options(cfg)
     points, normals, attributes, notes = io.read_cloud(cfg.input, normals=cfg.normals == "auto", columns=cfg.columns)
     origin = "with normals" if normals is not None else "normals estimated and oriented"
     say(f"input:  {cfg.input}, {len(points)} points, {origin}")
@@ -80,7 +79,7 @@ def reconstruct(cfg: Any) -> None:
     mesh = surface.mesh
     extra: dict[str, Any] = {}
     if "colors" in attributes:
-        extra["colors"] = reconstruction.interpolate(points, attributes["colors"][:, :3], mesh.vertices) / 255
+        extra["colors"] = reconstruction.interpolated_values(points, attributes["colors"][:, :3], mesh.vertices) / 255
     if truth is not None:
         errors = reconstruction.surface_errors(mesh, truth, rng=np.random.default_rng(cfg.seed))
         extra = {"quality": errors.distance, "colors": errors.colors(cfg.limit, cfg.colormap)}
@@ -99,7 +98,7 @@ def reconstruct(cfg: Any) -> None:
     say(f"next:   {shell_line('picture', inputs=[cfg.input, cfg.output], output='picture.png', **names)}")
 
 
-def check_options(cfg: Any) -> None:
+def _check_options(cfg: Any) -> None:
     """Refuse what can be refused before the work begins."""
     from pnu.io import MESH_OUTPUTS, check_writable
     from pnu.rendering.colors import COLORMAPS
@@ -117,11 +116,6 @@ def check_options(cfg: Any) -> None:
     if Path(cfg.output).resolve() == Path(cfg.input).resolve():
         raise ValueError(f"output={cfg.output}: is the input; give another name")
     check_writable(cfg.output)
-
-
-def warn(text: str) -> None:
-    """A line on stderr."""
-    print(f"warning: {text}", file=sys.stderr)
 
 
 main = command(reconstruct, Reconstruct)

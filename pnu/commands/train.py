@@ -37,7 +37,7 @@ class Train:
 
 def train(cfg: Any) -> list[float] | None:
     """Train as the config says; the best validation's values of what the config names as objective."""
-    from pnu.training.closing_lines import closing, job_line, objective
+    from pnu.training.closing_lines import closing_lines, job_line, objective
     from pnu.training.resuming import open_run
     from pnu.training.run_folder import is_main_process
 
@@ -91,11 +91,11 @@ def train(cfg: Any) -> list[float] | None:
             run.add_metrics("start" if source else "untrained", trainer.validate(module, data, verbose=False))
         trainer.fit(module, data, ckpt_path=start, weights_only=True)
         if run.best.exists():
-            module.load_state_dict(checkpoints.read(run.best)["state_dict"])
+            module.load_state_dict(checkpoints.read_checkpoint(run.best)["state_dict"])
         run.add_metrics("test", trainer.test(module, data, verbose=False))
         result = objective(config, run)
     if is_main_process():
-        print(run if config["quiet"] else job_line(run) if "job" in run.facts else closing(run))
+        print(run if config["quiet"] else job_line(run) if "job" in run.facts else closing_lines(run))
     return result
 
 

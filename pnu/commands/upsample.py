@@ -74,7 +74,7 @@ def upsample(cfg: Any) -> None:
     if cfg.sample is None:
         cloud = io.read_cloud(cfg.input, normals=cfg.normals == "auto", columns=cfg.columns)
     else:
-        cloud = sampled(cfg.input, cfg.sample, cfg.normals == "auto", cfg.seed)
+        cloud = _sampled(cfg.input, cfg.sample, cfg.normals == "auto", cfg.seed)
     origin = "with normals" if cloud.normals is not None else "normals estimated and oriented"
     say(f"input:  {cfg.input}, {len(cloud.points)} points, {origin}")
     for note in cloud.notes:
@@ -102,9 +102,13 @@ def upsample(cfg: Any) -> None:
     say(f"        {look}")
     for text in look.warnings():
         say(f"        {text}")
-    run = whole_clouds.source(cfg.run, cloud.normals)
+    run = whole_clouds.weights_source(cfg.run, cloud.normals)
     chosen = (
-        " (the newest finished one)" if cfg.run == NEWEST else " (comes with pnu)" if run in weights.names() else ""
+        " (the newest finished one)"
+        if cfg.run == NEWEST
+        else " (comes with pnu)"
+        if run in weights.shipped_names()
+        else ""
     )
     say(f"run:    {run}{chosen}")
     # a long one goes on, after an interruption, from the parts that are done
@@ -143,7 +147,7 @@ def upsample(cfg: Any) -> None:
     say(f"next:   {shell_line('reconstruct', input=cfg.output, output='mesh.ply')}")
 
 
-def sampled(path: str, count: int, normals: bool, seed: int) -> "Cloud":
+def _sampled(path: str, count: int, normals: bool, seed: int) -> "Cloud":
     """So many points spread evenly over the faces of a mesh, with their normals."""
     import numpy as np
 

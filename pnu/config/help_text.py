@@ -11,7 +11,7 @@ from pnu.config.schema import Groups, class_arguments, fields, groups, library, 
 from pnu.config.signature import Argument, arguments, summary
 
 
-def shown(value: Any) -> str:
+def as_typed(value: Any) -> str:
     """A value as one types it."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
@@ -99,7 +99,7 @@ def group_lines(content: Any, group: str, prefix: str, allow: Any) -> Iterator[s
 
 def line(key: str, value: Any, words: str) -> str:
     """One key of the help."""
-    return f"  {key + '=' + (value if value == '...' else shown(value)):<40} {words}".rstrip()
+    return f"  {key + '=' + (value if value == '...' else as_typed(value)):<40} {words}".rstrip()
 
 
 def reference() -> str:
@@ -128,6 +128,6 @@ def reference() -> str:
                     if library(target) and key not in here:
                         continue
                     value = here.get(key, argument.default)
-                    text = "" if value is REQUIRED or value is UNREADABLE else f"`{shown(value)}`"
+                    text = "" if value is REQUIRED or value is UNREADABLE else f"`{as_typed(value)}`"
                     lines.append(f"| `{prefix}{key}` | {type_name(argument.hint)} | {text} | {argument.words} |")
     return "\n".join(lines) + "\n"

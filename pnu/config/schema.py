@@ -311,13 +311,13 @@ def converted(value: Any, argument: Argument, key: str) -> Any:
 
     try:
         plain = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
-        return convert(plain, argument.hint)
+        return as_type(plain, argument.hint)
     except TypeError:
         text = f" ({argument.words})" if argument.words else ""
         raise ValueError(f"{key}={value}: expected {type_name(argument.hint)}{text}") from None
 
 
-def convert(value: Any, hint: Any) -> Any:
+def as_type(value: Any, hint: Any) -> Any:
     """A value as a type wants it: first as it is, then as YAML may have meant it (1 for 1.0, 7 for "7").
 
     Raises:
@@ -341,9 +341,9 @@ def exact(value: Any, hint: Any) -> Any:
     if origin is typing.Literal:
         right = any(type(choice) is type(value) and choice == value for choice in inner)
     elif origin is list and isinstance(value, list):
-        return [convert(item, inner[0]) for item in value] if inner else value
+        return [as_type(item, inner[0]) for item in value] if inner else value
     elif origin is tuple and isinstance(value, list) and len(value) == len(inner):
-        return [convert(item, one) for item, one in zip(value, inner, strict=True)]
+        return [as_type(item, one) for item, one in zip(value, inner, strict=True)]
     elif origin in (bool, int, float, str, type(None)):
         right = type(value) is origin
     else:

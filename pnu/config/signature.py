@@ -26,7 +26,7 @@ class Argument(NamedTuple):
     """An argument of a constructor."""
 
     name: str
-    hint: Any  # a type as `pnu.config.schema.convert` takes it; a `Class` where it is made of a group of keys
+    hint: Any  # a type as `pnu.config.schema.as_type` takes it; a `Class` where it is made of a group of keys
     default: Any  # REQUIRED, UNREADABLE or the value
     words: str
 
@@ -202,14 +202,14 @@ def read_hint(node: ast.expr, module: Module) -> Any:
         if node.value is None:
             return type(None)
     if isinstance(node, ast.BinOp):
-        return union([node.left, node.right], module)
+        return union_hint([node.left, node.right], module)
     if isinstance(node, ast.Subscript):
         name = last_name(node.value)
         inner = list(node.slice.elts) if isinstance(node.slice, ast.Tuple) else [node.slice]
         if name == "Optional":
-            return union([*inner, ast.Constant(None)], module)
+            return union_hint([*inner, ast.Constant(None)], module)
         if name == "Union":
-            return union(inner, module)
+            return union_hint(inner, module)
         if name == "Literal":
             return typing.Literal[tuple(ast.literal_eval(part) for part in inner)]
         if name in LISTS:
@@ -237,7 +237,7 @@ def read_hint(node: ast.expr, module: Module) -> Any:
     raise NotGiveable(name)
 
 
-def union(nodes: list[ast.expr], module: Module) -> Any:
+def union_hint(nodes: list[ast.expr], module: Module) -> Any:
     """The types of `a | b`, as one."""
     members: list[Any] = []
     for node in nodes:

@@ -28,7 +28,7 @@ def rod(radius: float, height: float, at: Sequence[float] = (0, 0, 0), top: floa
     return Manifold.cylinder(height, radius, radius if top is None else top, segments, True).translate(tuple(at))
 
 
-def tube(radius: float, wall: float, height: float, at: Sequence[float] = (0, 0, 0)) -> Manifold:
+def pipe(radius: float, wall: float, height: float, at: Sequence[float] = (0, 0, 0)) -> Manifold:
     """A hollow cylinder."""
     return rod(radius, height, at) - rod(radius - wall, 2 * height, at)
 
@@ -77,7 +77,7 @@ def gear(teeth: int = 18, helix: float = 0.0, hub: float = 0.3) -> Mesh:
     shift = np.tile([0.12, 0.06, -0.06, -0.12], teeth) * 2 * np.pi / teeth
     outline = np.stack([radius * np.cos(angle + shift), radius * np.sin(angle + shift)], 1)
     body = CrossSection([outline]).extrude(0.35, 24 if helix else 0, helix)
-    web = tube(0.7, 0.7 - hub - 0.05, 0.12, (0, 0, 0.35)) + tube(0.7, 0.7 - hub - 0.05, 0.12, (0, 0, 0))
+    web = pipe(0.7, 0.7 - hub - 0.05, 0.12, (0, 0, 0.35)) + pipe(0.7, 0.7 - hub - 0.05, 0.12, (0, 0, 0))
     key = block(0.1, 0.12, 1, (hub - 0.12, 0, 0))
     return mesh_of(body - web - rod(hub - 0.14, 2) - key)
 
@@ -97,7 +97,7 @@ def nut(sides: int = 6) -> Mesh:
 def bolt() -> Mesh:
     """A bolt, around the origin."""
     head = rod(0.42, 0.28, (0, 0, 1.0), segments=6)
-    grooves = sum_of([tube(0.4, 0.22, 0.05, (0, 0, z)) for z in np.arange(-0.75, 0.3, 0.11)])
+    grooves = sum_of([pipe(0.4, 0.22, 0.05, (0, 0, z)) for z in np.arange(-0.75, 0.3, 0.11)])
     return mesh_of(head + rod(0.22, 1.9) + rod(0.22, 0.12, (0, 0, -1.0), 0.2) - grooves)
 
 
@@ -108,7 +108,7 @@ def washer() -> Mesh:
 
 def spring_clip() -> Mesh:
     """A spring clip, around the origin."""
-    ring = tube(0.6, 0.05, 1.0) - block(0.5, 2, 2, (0.6, 0, 0))
+    ring = pipe(0.6, 0.05, 1.0) - block(0.5, 2, 2, (0.6, 0, 0))
     ears = [block(0.5, 0.05, 1.0, (0.55, 0.45 * side, 0)).rotate((0, 0, -12 * side)) for side in (1, -1)]
     return mesh_of(sum_of([ring, *ears]))
 
@@ -116,7 +116,7 @@ def spring_clip() -> Mesh:
 def enclosure() -> Mesh:
     """An enclosure, around the origin."""
     shell = plate(1.6, 1.1, 0.6, 0.12) - plate(1.5, 1.0, 0.6, 0.08).translate((0, 0, 0.06))
-    posts = sum_of([tube(0.09, 0.05, 0.5, (x, y, 0)) for x in (-0.62, 0.62) for y in (-0.38, 0.38)])
+    posts = sum_of([pipe(0.09, 0.05, 0.5, (x, y, 0)) for x in (-0.62, 0.62) for y in (-0.38, 0.38)])
     slots = sum_of([block(0.06, 0.3, 1, (x, 0, 0)) for x in np.linspace(-0.35, 0.35, 6)])
     return mesh_of(shell + posts - slots)
 
@@ -168,7 +168,7 @@ def hinge() -> Mesh:
     leaf = plate(0.9, 1.2, 0.07, 0.1).translate((0.5, 0, 0)) - sum_of(
         [rod(0.07, 1, (0.65, y, 0)) + rod(0.13, 0.08, (0.65, y, 0.02), 0.16) for y in (-0.4, 0, 0.4)]
     )
-    knuckle = sum_of([tube(0.13, 0.06, 0.22).rotate((90, 0, 0)).translate((0, y, 0)) for y in (-0.48, 0, 0.48)])
+    knuckle = sum_of([pipe(0.13, 0.06, 0.22).rotate((90, 0, 0)).translate((0, y, 0)) for y in (-0.48, 0, 0.48)])
     return mesh_of(leaf + knuckle)
 
 

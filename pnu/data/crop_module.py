@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from typing import Any, Literal
 
 from pnu.data import shapes
-from pnu.data.crops import SMALLEST, Crops, WholeClouds, flattened, stacked
+from pnu.data.crops import SMALLEST, Crops, WholeClouds, flattened, stacked_items
 from pnu.data.mesh_scene import MeshScene
 from pnu.data.patch_module import EpochDataModule, say_open
 from pnu.geometry.mesh_topology import open_edges
@@ -30,7 +30,7 @@ class ProjectionDataModule(EpochDataModule):
     """
 
     kind = "clouds"
-    collate, collate_evaluation = staticmethod(flattened), staticmethod(stacked)
+    collate, collate_evaluation = staticmethod(flattened), staticmethod(stacked_items)
 
     def __init__(
         self, root: str | None = None, procedural: bool = True, validation: Iterable[str] = (),
@@ -56,7 +56,7 @@ class ProjectionDataModule(EpochDataModule):
         if self.truth is not None:
             return
         files = meshes_of(self.root) if self.root else {}
-        meshes = {name: shapes.unit(read_mesh(path)) for name, path in files.items()}
+        meshes = {name: shapes.unit_mesh(read_mesh(path)) for name, path in files.items()}
         if self.process[0] == 0:
             say_open({name: open_edges(mesh) for name, mesh in meshes.items()})
         if self.procedural:

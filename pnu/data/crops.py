@@ -71,7 +71,11 @@ class Crops(Dataset[dict[str, Any]]):
             clean, noisy = self.cloud(self.meshes[shape], rng)
         rough = rough_normals(noisy[:, :3], clean[:, 3:]) if self.mixed else None
         views = [self.crop(clean, noisy, rng, rough) for _ in range(self.views)]
-        return {**stacked(views), "index": torch.full((self.views,), shape), "shape": [self.names[shape]] * self.views}
+        return {
+            **stacked_items(views),
+            "index": torch.full((self.views,), shape),
+            "shape": [self.names[shape]] * self.views,
+        }
 
     def crop(
         self, clean: np.ndarray, noisy: np.ndarray, rng: np.random.Generator, rough: np.ndarray | None = None
@@ -169,7 +173,7 @@ class WholeClouds(Dataset[dict[str, Any]]):
         return self.items[index]
 
 
-def stacked(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def stacked_items(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """A batch of items of one size: tensors and numbers stacked, text as a list."""
     batch: dict[str, Any] = {name: [item[name] for item in items] for name in items[0]}
     for name, values in batch.items():
@@ -184,5 +188,5 @@ def flattened(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """A batch of the views of all items."""
     return {
         name: value.flatten(0, 1) if isinstance(value, Tensor) else [text for texts in value for text in texts]
-        for name, value in stacked(items).items()
+        for name, value in stacked_items(items).items()
     }

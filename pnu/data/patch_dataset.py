@@ -157,7 +157,9 @@ class EpochSampler(Sampler[tuple[int, int]]):
         return iter([(self.epoch, i) for i in mine[start:]])
 
 
-def split(names: Sequence[str] | None, patches: int, *, val: float, test: float, seed: int) -> dict[str, list[int]]:
+def split_shapes(
+    names: Sequence[str] | None, patches: int, *, val: float, test: float, seed: int
+) -> dict[str, list[int]]:
     """Rows of a file for "train", "val" and "test": whole shapes in an order from the seed, never patches of one shape
     in two of them. Without names, blocks of consecutive rows at the end (neighbors in a file mostly share a shape).
 

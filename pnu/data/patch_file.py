@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pnu.data.shapes import unit
+from pnu.data.shapes import unit_mesh
 from pnu.geometry.mesh_sampling import sample_area
 from pnu.geometry.mesh_topology import open_edges
 from pnu.geometry.sampling import farthest_points_large
@@ -32,7 +32,7 @@ CHECKED = 2**18  # points that are checked at once
 DENSEST = 100  # bytes that a byte of the file may stand for; compressed coordinates stay far below, forged headers not
 
 
-class Patches(NamedTuple):
+class ShapePatches(NamedTuple):
     """Patches of one shape."""
 
     clouds: np.ndarray  # (p, 4096, 6) float32, points in the frame of the shape and unit normals
@@ -40,7 +40,7 @@ class Patches(NamedTuple):
     open_edges: int  # of the mesh, see `pnu.geometry.mesh_topology.open_edges`
 
 
-def cut_patches(mesh: Mesh, count: int, rng: np.random.Generator) -> Patches:
+def cut_patches(mesh: Mesh, count: int, rng: np.random.Generator) -> ShapePatches:
     """Patches of 4096 evenly spread points: centers by farthest points, the nearest points of each by distance, as at
     inference. Half of them are cut from a dense sampling and cover a small share of the shape, half from a sparse one.
     """
@@ -55,7 +55,7 @@ def cut_patches(mesh: Mesh, count: int, rng: np.random.Generator) -> Patches:
         clouds.append(dense[cKDTree(dense[:, :3]).query(centers, PATCH_POINTS)[1]])
     patches = np.concatenate(clouds)
     edges = np.stack([edges_of(patch, sharp, rng) for patch in patches])
-    return Patches(patches, edges, open_edges(mesh))
+    return ShapePatches(patches, edges, open_edges(mesh))
 
 
 def edges_of(patch: np.ndarray, sharp: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -133,7 +133,9 @@ def reserve(path: Path, size: int) -> None:
             os.posix_fallocate(handle.fileno(), 0, size)
 
 
-def results_of(jobs: list[tuple[str, Callable[[], Mesh], int, int]], processes: int) -> Iterable[tuple[str, Patches]]:
+def results_of(
+    jobs: list[tuple[str, Callable[[], Mesh], int, int]], processes: int
+) -> Iterable[tuple[str, ShapePatches]]:
     """The patches of each job, as its process ends, in order."""
     if processes <= 1:
         yield from map(job, jobs)
@@ -154,12 +156,12 @@ def end_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def job(arguments: tuple[str, Callable[[], Mesh], int, int]) -> tuple[str, Patches]:
+def job(arguments: tuple[str, Callable[[], Mesh], int, int]) -> tuple[str, ShapePatches]:
     """The patches of one shape, whose randomness comes from the seed and its name alone."""
     name, make, count, seed = arguments
     rng = np.random.default_rng([seed, *name.encode()])
     try:
-        return name, cut_patches(unit(make()), count, rng)
+        return name, cut_patches(unit_mesh(make()), count, rng)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
 
@@ -186,11 +188,11 @@ def check_patch_file(path: str | Path) -> Contents:
     if not path.is_file():
         raise ValueError(f"{path}: no such file; expected an HDF5 file of patches as data/README.md describes")
     found = path.stat()
-    return checked(path, found.st_ino, found.st_size, found.st_mtime_ns)
+    return checked_contents(path, found.st_ino, found.st_size, found.st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=16)
-def checked(path: Path, *_: int) -> Contents:
+def checked_contents(path: Path, *_: int) -> Contents:
     """`check` of a file that has not changed since: its number, size and time are arguments too."""
     with opened(path) as file:
         return contents_of(path, file)

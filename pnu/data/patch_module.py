@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader, Dataset, Subset
 
 from pnu.data import shapes
 from pnu.data.augment import Augmentation, from_options
-from pnu.data.patch_dataset import Downsampling, EpochSampler, Options, PatchDataset, check_options, split
+from pnu.data.patch_dataset import Downsampling, EpochSampler, Options, PatchDataset, check_options, split_shapes
 from pnu.data.patch_file import check_patch_file, cut_patch_file, told_open
 from pnu.io import Mesh, meshes_of, read_mesh
 from pnu.runtime.progress import counted
@@ -177,7 +177,7 @@ class PatchDataModule(EpochDataModule):
         if contents.names is None:
             say(f"{self.file} has no shape names: validation and test are its last blocks of consecutive patches")
         self.names = contents.names
-        self.rows = split(contents.names, contents.patches, **self.shares, seed=0)
+        self.rows = split_shapes(contents.names, contents.patches, **self.shares, seed=0)
         self.check_batch_size(len(self.rows["train"]), str(self.file))
         self.datasets = {part: self.dataset(part) for part in self.rows}
 

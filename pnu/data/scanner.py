@@ -1,6 +1,6 @@
 """Simulated scans: what a scanner, a depth camera, a laser or photogrammetry would give of a mesh.
 
-Meshes are of the unit sphere (`pnu.data.shapes.unit`), faces outward. Rays are cast by Open3D.
+Meshes are of the unit sphere (`pnu.data.shapes.unit_mesh`), faces outward. Rays are cast by Open3D.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,7 +28,7 @@ class Scan(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Camera:
+class DepthCamera:
     """A sensor that casts a grid of rays, and its faults; lengths in radii of the shape.
 
     Args:
@@ -86,7 +86,7 @@ class Scanner:
         self.mesh = mesh
         self.scene: Any = None
 
-    def views(self, sensors: np.ndarray, camera: Camera, rng: np.random.Generator) -> Scan:
+    def views(self, sensors: np.ndarray, camera: DepthCamera, rng: np.random.Generator) -> Scan:
         """What the same camera sees from sensors (v, 3), looking at the center."""
         return _together([self._view(sensor, camera, rng) for sensor in sensors])
 
@@ -124,7 +124,7 @@ class Scanner:
         points = clean[:, :3] + noise * rng.standard_normal((n, 3))
         return Scan(points, clean[:, 3:] * sign[:, None], clean, np.full((n, 3), np.nan), np.zeros(n, bool))
 
-    def _view(self, sensor: np.ndarray, camera: Camera, rng: np.random.Generator) -> Scan:
+    def _view(self, sensor: np.ndarray, camera: DepthCamera, rng: np.random.Generator) -> Scan:
         if self.scene is None:
             self.scene = ray_casting_scene([self.mesh], [np.zeros(3)])
         rays = _rays(sensor, camera)
@@ -153,18 +153,18 @@ class Scanner:
 
 def orbit(scanner: Scanner, rng: np.random.Generator) -> Scan:
     """Structured light from ten sides, the views not quite aligned."""
-    return scanner.views(3.0 * sphere_directions(10, rng), Camera(turn=0.2, shift=0.002), rng)
+    return scanner.views(3.0 * sphere_directions(10, rng), DepthCamera(turn=0.2, shift=0.002), rng)
 
 
 def oneview(scanner: Scanner, rng: np.random.Generator) -> Scan:
     """One depth camera: one side only, depth in steps, points torn off at edges."""
-    camera = Camera(half=0.42, across=110, down=110, slant=0.1, step=0.004, torn=0.25)
+    camera = DepthCamera(half=0.42, across=110, down=110, slant=0.1, step=0.004, torn=0.25)
     return scanner.views(2.6 * sphere_directions(7, rng)[rng.integers(7)][None], camera, rng)
 
 
 def lines(scanner: Scanner, rng: np.random.Generator) -> Scan:
     """A laser from four places, ten times as dense along a line as across lines."""
-    camera = Camera(half=0.38, across=260, down=26, noise=0.0015, slant=0.12)
+    camera = DepthCamera(half=0.38, across=260, down=26, noise=0.0015, slant=0.12)
     return scanner.views(2.8 * sphere_directions(4, rng), camera, rng)
 
 
@@ -195,7 +195,7 @@ def any_scan(scanner: Scanner, rng: np.random.Generator) -> Scan:
         return scanner.photogrammetry(of, rng)
     distance = rng.uniform(2.2, 4)
     fit = 1.08 / np.sqrt(distance**2 - 1)  # the whole shape, tightly
-    camera = Camera(
+    camera = DepthCamera(
         distance, fit * rng.uniform(0.7, 1.1), noise=noise, slant=rng.uniform(0.05, 0.4),
         step=rng.uniform(0.001, 0.006) if rng.random() < 0.3 else 0.0,
         turn=rng.uniform(0, 0.4), shift=rng.uniform(0, 0.004), torn=rng.uniform(0, 0.4) if rng.random() < 0.6 else 0.0,
@@ -225,7 +225,7 @@ def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
-def _rays(sensor: np.ndarray, camera: Camera) -> np.ndarray:
+def _rays(sensor: np.ndarray, camera: DepthCamera) -> np.ndarray:
     """Unit directions of a grid of rays through the center, (down across, 3), row by row."""
     ahead = -sensor / np.linalg.norm(sensor)
     right = np.cross(ahead, UP if abs(ahead[2]) < 0.9 else UP[[2, 1, 0]])

@@ -25,11 +25,11 @@ def make(name: str) -> Mesh:
     """The closed mesh of that name, faces outward, centered in its box, greatest distance from the center 1."""
     for shapes in KINDS.values():
         if name in shapes:
-            return unit(shapes[name]())
+            return unit_mesh(shapes[name]())
     raise ValueError(f"no shape {name!r}; there are {', '.join(names())}")
 
 
-def unit(mesh: Mesh) -> Mesh:
+def unit_mesh(mesh: Mesh) -> Mesh:
     """A mesh moved and scaled: the center of its box is 0 and the greatest distance from it 1."""
     centered = mesh.vertices - (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     return Mesh(centered / np.linalg.norm(centered, axis=1).max(), mesh.faces)

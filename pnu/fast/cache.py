@@ -6,7 +6,7 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from pnu.fast.neighborhoods import Groups
+from pnu.fast.neighborhoods import Neighborhoods
 from pnu.runtime import threads
 
 CHUNK = 2**17  # floats in the widest matrix of a chunk: 512 KiB, a handful of which fit the cache of a core
@@ -41,7 +41,7 @@ def row_chunks(rows: int, width: int) -> list[Chunk]:
     return [Chunk(i, start, min(start + step, rows)) for i, start in enumerate(range(0, rows, step))]
 
 
-def group_chunks(groups: Groups, width: int) -> list[Chunk]:
+def group_chunks(groups: Neighborhoods, width: int) -> list[Chunk]:
     """Chunks of whole groups of equal size."""
     chunks: list[Chunk] = []
     row = group = 0

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from pnu.fast import stack
 from pnu.fast.combine import combine
-from pnu.fast.neighborhoods import Groups, distinct, pool, single, whole
+from pnu.fast.neighborhoods import Neighborhoods, distinct, pool, single, whole
 from pnu.geometry.grouping import gather
 from pnu.geometry.neighbor_search import ball_query, knn
 from pnu.networks import layers, pugeo
@@ -29,7 +29,7 @@ def through(
     x: Tensor,
     *,
     projected: bool = False,
-    groups: Groups | None = None,
+    groups: Neighborhoods | None = None,
     centers: Tensor | None = None,
 ) -> Tensor:
     """Rows (..., C) through all layers.
@@ -41,12 +41,12 @@ def through(
     """
     rows = x.reshape(-1, x.shape[-1])
     if streamed(x, mlp.training):
-        run = stack.train if mlp.training else stack.infer
-        rows = run(rows, stacked(mlp), projected=projected, groups=groups, centers=centers)
+        run = stack.train_stack if mlp.training else stack.infer_stack
+        rows = run(rows, layers_of(mlp), projected=projected, groups=groups, centers=centers)
     else:
         if groups is not None and centers is not None:
             rows = combine(rows, groups.source[:, None]) - centers[groups.owner]
-        for i, layer in enumerate(stacked(mlp)):
+        for i, layer in enumerate(layers_of(mlp)):
             rows = from_products(layer, rows) if projected and i == 0 else layer(rows)
         rows = rows if groups is None else pool(rows, groups)
     return rows if groups is not None else rows.view(*x.shape[:-1], rows.shape[-1])
@@ -58,14 +58,14 @@ def from_products(layer: layers.Layer, products: Tensor) -> Tensor:
     return rows.relu()
 
 
-def stacked(mlp: layers.MLP) -> Sequence[layers.Layer]:
+def layers_of(mlp: layers.MLP) -> Sequence[layers.Layer]:
     """The layers of an MLP, for the streamed form."""
     return [layer for layer in mlp if isinstance(layer, layers.Layer)]
 
 
 def first_weight(mlp: layers.MLP, split: int) -> tuple[Tensor, Tensor]:
     """Weight of the first layer for the first `split` columns of its input, and for the others."""
-    weight = stacked(mlp)[0].linear.weight
+    weight = layers_of(mlp)[0].linear.weight
     return weight[:, :split], weight[:, split:]
 
 
@@ -102,7 +102,7 @@ class Abstraction(layers.Abstraction):
         neighbors = ball_query(centers, points, self.radius, self.k)
         groups = (distinct if streamed(points, self.training) else single)(neighbors, n)
         of_offsets, _ = first_weight(self.mlp, 3)
-        of_points = F.linear(torch.cat([points, features], -1).flatten(0, 1), stacked(self.mlp)[0].linear.weight)
+        of_points = F.linear(torch.cat([points, features], -1).flatten(0, 1), layers_of(self.mlp)[0].linear.weight)
         of_centers = F.linear(centers.reshape(-1, 3), of_offsets)
         return through(self.mlp, of_points, projected=True, groups=groups, centers=of_centers).view(clouds, m, -1)
 

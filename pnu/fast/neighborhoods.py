@@ -2,7 +2,7 @@
 
 A ball query fills up small balls with copies of their first point: of 32 neighbors in a patch of 1024 points often 20
 are copies. They change the statistics of batch norm, by their number, but neither the maximum nor its gradient.
-`Groups` keeps each neighbor once, with its multiplicity.
+`Neighborhoods` keeps each neighbor once, with its multiplicity.
 """
 
 from typing import NamedTuple
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 
-class Groups(NamedTuple):
+class Neighborhoods(NamedTuple):
     """Rows, one a neighbor, in groups, one a neighborhood; groups of equal size stand together.
 
     Neighborhoods and points are counted through the batch: neighborhood i of cloud b is b m + i.
@@ -29,15 +29,15 @@ class Groups(NamedTuple):
         return sum(number for number, _ in self.runs)
 
 
-def single(neighbors: Tensor, n: int) -> Groups:
+def single(neighbors: Tensor, n: int) -> Neighborhoods:
     """Groups of neighbors (B, m, k) in clouds of n points: every neighbor one row, in order."""
     clouds, m, k = neighbors.shape
     source = (neighbors + torch.arange(clouds, device=neighbors.device).view(-1, 1, 1) * n).flatten()
     owner = torch.arange(clouds * m, device=neighbors.device).repeat_interleave(k)
-    return Groups(source, owner, None, None, [(clouds * m, k)])
+    return Neighborhoods(source, owner, None, None, [(clouds * m, k)])
 
 
-def distinct(neighbors: Tensor, n: int) -> Groups:
+def distinct(neighbors: Tensor, n: int) -> Neighborhoods:
     """Groups of neighbors (B, m, k) in clouds of n points; copies of a neighborhood's first are counted, not kept."""
     clouds, m, k = neighbors.shape
     flat = (neighbors + torch.arange(clouds).view(-1, 1, 1) * n).view(clouds * m, k)
@@ -48,7 +48,7 @@ def distinct(neighbors: Tensor, n: int) -> Groups:
     multiplicity[:, 0] = k + 1.0 - kept.sum(1)
     kept = kept[order]
     numbers = torch.bincount(size, minlength=k + 1).tolist()
-    return Groups(
+    return Neighborhoods(
         source=flat[order][kept],
         owner=order.repeat_interleave(size),
         multiplicity=multiplicity[order][kept],
@@ -57,13 +57,13 @@ def distinct(neighbors: Tensor, n: int) -> Groups:
     )
 
 
-def whole(clouds: int, n: int) -> Groups:
+def whole(clouds: int, n: int) -> Neighborhoods:
     """One group for each cloud of n rows."""
     owner = torch.arange(clouds).repeat_interleave(n)
-    return Groups(torch.arange(clouds * n), owner, None, None, [(clouds, n)])
+    return Neighborhoods(torch.arange(clouds * n), owner, None, None, [(clouds, n)])
 
 
-def pool(rows: Tensor, groups: Groups) -> Tensor:
+def pool(rows: Tensor, groups: Neighborhoods) -> Tensor:
     """Maximum of the rows (R, C) of each neighborhood: (G, C), in the order of neighborhoods."""
     parts, start = [], 0
     for number, size in groups.runs:
@@ -73,6 +73,6 @@ def pool(rows: Tensor, groups: Groups) -> Tensor:
     return ungroup(torch.cat(parts), groups)
 
 
-def ungroup(pooled: Tensor, groups: Groups) -> Tensor:
+def ungroup(pooled: Tensor, groups: Neighborhoods) -> Tensor:
     """Values (G, C) of groups in the order of neighborhoods."""
     return pooled if groups.order is None else torch.empty_like(pooled).index_copy(0, groups.order, pooled)

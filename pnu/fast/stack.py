@@ -28,19 +28,19 @@ from torch.autograd.function import once_differentiable
 
 from pnu.fast.cache import Chunk, Scratch, group_chunks, map_chunks, row_chunks
 from pnu.fast.combine import scatter
-from pnu.fast.neighborhoods import Groups, ungroup
+from pnu.fast.neighborhoods import Neighborhoods, ungroup
 from pnu.networks.layers import Layer
 from pnu.networks.norm import BatchNorm, check_rows, everywhere
 
 FAR = 8  # deviations between threshold and mean, beyond which their difference costs too many digits
 
 
-def train(
+def train_stack(
     x: Tensor,
     layers: Sequence[Layer],
     *,
     projected: bool = False,
-    groups: Groups | None = None,
+    groups: Neighborhoods | None = None,
     centers: Tensor | None = None,
 ) -> Tensor:
     """Layers in training mode on CPU rows x (R, C): (R, C'), or their maximum over groups, (G, C').
@@ -118,7 +118,7 @@ class Differences(NamedTuple):
 
     table: Tensor  # (points, C)
     centers: Tensor  # (G, C), in the order of groups
-    groups: Groups
+    groups: Neighborhoods
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -132,13 +132,13 @@ class Differences(NamedTuple):
         return out
 
 
-def _rows(x: Tensor, groups: Groups | None, centers: Tensor | None) -> Rows | Differences:
+def _rows(x: Tensor, groups: Neighborhoods | None, centers: Tensor | None) -> Rows | Differences:
     if centers is None or groups is None:
         return Rows(x)
     return Differences(x, centers if groups.order is None else centers[groups.order], groups)
 
 
-class Source(NamedTuple):
+class LayerInput(NamedTuple):
     """Where the input of a layer comes from: rows as they are, or the products of the layer below, rectified."""
 
     rows: Rows | Differences
@@ -153,12 +153,17 @@ class Source(NamedTuple):
 class _Stack(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, x: Tensor, centers: Tensor | None, layers: Sequence[Layer], groups: Groups | None, *parameters: Tensor
+        ctx: Any,
+        x: Tensor,
+        centers: Tensor | None,
+        layers: Sequence[Layer],
+        groups: Neighborhoods | None,
+        *parameters: Tensor,
     ) -> Tensor:
         often = groups.multiplicity if groups else None
         often = often if often is None else often.to(x.dtype)
         first = _rows(x, groups, centers)
-        source, stored, norms, weights = Source(first), [], [], []
+        source, stored, norms, weights = LayerInput(first), [], [], []
         pooled = None
         for i, layer in enumerate(layers):
             weight = parameters[i]
@@ -170,7 +175,7 @@ class _Stack(torch.autograd.Function):
             norms.append(_statistics(layer, weight, source.norm, moments))
             stored.append(None if weight is None else products.table)
             weights.append(weight)
-            source = Source(products, norms[-1])
+            source = LayerInput(products, norms[-1])
         ctx.layers, ctx.groups, ctx.norms, ctx.points = layers, groups, norms, len(x)
         sorted_centers = first.centers if isinstance(first, Differences) else None
         ctx.save_for_backward(often, pooled, x, sorted_centers, *stored, *weights)
@@ -192,7 +197,7 @@ class _Stack(torch.autograd.Function):
         often, pooled, x, centers, *tensors = ctx.saved_tensors
         first = Rows(x) if centers is None else Differences(x, centers, groups)
         products = [first if table is None else Rows(table) for table in tensors[:depth]]
-        sources = [Source(first), *map(Source, products, norms)]  # sources[i] is the input of layer i
+        sources = [LayerInput(first), *map(LayerInput, products, norms)]  # sources[i] is the input of layer i
         weights = tensors[depth:]
         d_weights: list[Tensor | None] = [None] * depth
         d_scales, d_shifts = [], []
@@ -225,12 +230,17 @@ class _Stack(torch.autograd.Function):
         return (kept, d_centers, None, None, *d_weights, *d_biases, *reversed(d_scales), *reversed(d_shifts))
 
 
-def _chunks(rows: int, width: int, groups: Groups | None) -> list[Chunk]:
+def _chunks(rows: int, width: int, groups: Neighborhoods | None) -> list[Chunk]:
     return row_chunks(rows, width) if groups is None else group_chunks(groups, width)
 
 
 def _multiply(
-    source: Source, weight: Tensor | None, layer: Layer, often: Tensor | None, groups: Groups | None, last: bool
+    source: LayerInput,
+    weight: Tensor | None,
+    layer: Layer,
+    often: Tensor | None,
+    groups: Neighborhoods | None,
+    last: bool,
 ) -> tuple[Rows | Differences, Tensor | None, Moments]:
     """Products (R, C) of a layer, after the last one their maxima (G, C) over groups if given, and their moments.
 
@@ -275,7 +285,7 @@ def _multiply(
 
 def _statistics(layer: Layer, weight: Tensor | None, below: Norm | None, moments: Moments) -> Norm:
     """Batch norm from the moments of all products; updates the running statistics. `weight` is the one that the
-    products were made with, from activations as `Source` gives them."""
+    products were made with, from activations as `LayerInput` gives them."""
     norm, sign = layer.norm, _sign(layer.norm)
     count, mean, square = moments.rows, moments.mean, moments.square
     if norm.synchronized:
@@ -310,7 +320,7 @@ class _Gradient(NamedTuple):
     slope: Tensor
     level: Tensor
     often: Tensor | None
-    groups: Groups | None
+    groups: Neighborhoods | None
     pooled: Tensor | None  # maxima
 
     def chunk(self, chunk: Chunk, out: Tensor, space: Tensor) -> Tensor:
@@ -339,13 +349,13 @@ def _through_statistics(module: BatchNorm, norm: Norm, sums: Tensor) -> tuple[Te
 
 
 def _pull_back(
-    gradient: _Gradient, source: Source, weight: Tensor | None, wanted: bool
+    gradient: _Gradient, source: LayerInput, weight: Tensor | None, wanted: bool
 ) -> tuple[Tensor | None, Tensor, Tensor | None]:
     """From the gradient of a layer's products to that of its input; if there is a layer below, before its ReLU and
     times its scale.
 
     Returns it (None if it is not wanted), its sums as `_through_statistics` takes them, and the gradient of the weight
-    with respect to the activations as `Source` gives them.
+    with respect to the activations as `LayerInput` gives them.
     """
     (rows, columns), below = source.rows.shape, source.norm
     width, like = gradient.products.shape[1], gradient.kept
@@ -411,7 +421,7 @@ def _rectify_all(rows: Rows | Differences, norm: Norm, gradient: Tensor) -> tupl
     return kept, sums.sum(0)
 
 
-def _sums_of_groups(rows: Tensor, groups: Groups) -> Tensor:
+def _sums_of_groups(rows: Tensor, groups: Neighborhoods) -> Tensor:
     """Sums of the rows (R, C) of each group: (G, C)."""
     result = rows.new_empty(groups.number, rows.shape[1])
 
@@ -423,15 +433,15 @@ def _sums_of_groups(rows: Tensor, groups: Groups) -> Tensor:
     return result
 
 
-def infer(
+def infer_stack(
     x: Tensor,
     layers: Sequence[Layer],
     *,
     projected: bool = False,
-    groups: Groups | None = None,
+    groups: Neighborhoods | None = None,
     centers: Tensor | None = None,
 ) -> Tensor:
-    """`train` in eval mode and without gradient: batch norm folded into the weights, nothing stored between layers."""
+    """`train_stack` in eval mode and without gradient: batch norm folded into the weights, no layer stored."""
     folded = [_fold(layer) for layer in layers]
     rows = _rows(x, groups, centers)
     width = max(rows.shape[1], *(len(shift) for _, _, shift in folded))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pnu.geometry.spatial_blocks import Blocks, Index, split
+from pnu.geometry.spatial_blocks import Blocks, Index, split_blocks
 from pnu.runtime.progress import Step, silent
 
 BLOCK = 2**16  # points
@@ -64,7 +64,7 @@ def farthest_in_blocks(
     Time grows as the number of points, memory beyond the result with the blocks. `size`: points of a block.
     """
     n = len(xyz)
-    blocks = split(xyz, size or BLOCK)
+    blocks = split_blocks(xyz, size or BLOCK)
     wanted = min(SURPLUS * m, n)
     done, total = 0, 2 * len(blocks.members)
     step(0, total)

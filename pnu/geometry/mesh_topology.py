@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pnu.geometry.ragged import chunks, expand
+from pnu.geometry.ragged import chunks, expand_counts
 
 if TYPE_CHECKING:
     from pnu.io import Mesh
@@ -42,7 +42,7 @@ def corner_normals(mesh: Mesh, smooth: bool = True) -> NDArray[np.float64]:
     first = np.cumsum(count) - count
     total = np.zeros((len(vertex), 3))
     for part in chunks(count[vertex]):
-        corner, step = expand(count[vertex[part]])
+        corner, step = expand_counts(count[vertex[part]])
         corner += part.start
         other = by_vertex[first[vertex[corner]] + step] // 3
         joined = (flat[corner // 3] * flat[other]).sum(1) > np.cos(np.radians(CREASE_DEG))

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from pnu.geometry.neighbor_search import knn, nearest
 from pnu.geometry.noise_level import noise_level
-from pnu.geometry.orientation import ROWS, SOME_NOISE, Cloud, field, signs
+from pnu.geometry.orientation import ROWS, SOME_NOISE, NeighborCloud, field, signs
 
 
 def estimate_normals(points: Tensor, k: int = 16, *, orient: bool = True) -> Tensor:
@@ -22,7 +22,7 @@ def estimate_normals(points: Tensor, k: int = 16, *, orient: bool = True) -> Ten
     points = points.detach()
     planes = [_plane_normals(xyz, near) for xyz, near in zip(points, knn(points, points, k).idx, strict=True)]
     if orient:
-        planes = [_refined(Cloud.of(xyz), lines) for xyz, lines in zip(points, planes, strict=True)]
+        planes = [_refined(NeighborCloud.of(xyz), lines) for xyz, lines in zip(points, planes, strict=True)]
     return torch.stack(planes).to(points)
 
 
@@ -46,14 +46,14 @@ def orient_normals(points: Tensor, normals: Tensor) -> Tensor:
     Outward on closed shapes, whatever their number; the same side all over on an open sheet. Deterministic; beyond 4096
     points the global step sees an even subset, so that time stays linear.
     """
-    cloud = Cloud.of(points)
+    cloud = NeighborCloud.of(points)
     lines = torch.nn.functional.normalize(normals.to(cloud.points), dim=1)
     return normals * signs(cloud, lines)[:, None].to(normals)
 
 
 def refit_normals(points: Tensor, normals: Tensor) -> Tensor:
     """What `estimate_normals` makes of points (n, 3) once it knows their sides, those of normals (n, 3)."""
-    return _refined(Cloud.of(points), normals, oriented=True).to(points)
+    return _refined(NeighborCloud.of(points), normals, oriented=True).to(points)
 
 
 def flip_to_reference(normals: Tensor, points: Tensor, ref_points: Tensor, ref_normals: Tensor) -> Tensor:
@@ -74,7 +74,7 @@ def _plane_normals(points: Tensor, idx: Tensor, weight: Tensor | None = None) ->
     return torch.cat(normals)
 
 
-def _refined(cloud: Cloud, lines: Tensor, *, oriented: bool = False) -> Tensor:
+def _refined(cloud: NeighborCloud, lines: Tensor, *, oriented: bool = False) -> Tensor:
     """Oriented normals from lines (n, 3). Each turn of field and fit leaves cleaner lines for the next."""
     normals, noise = lines.to(cloud.points), SOME_NOISE
     for _ in range(2):
@@ -87,7 +87,7 @@ def _refined(cloud: Cloud, lines: Tensor, *, oriented: bool = False) -> Tensor:
     return normals
 
 
-def _sheet_normals(cloud: Cloud, normals: Tensor, noise: float) -> Tensor:
+def _sheet_normals(cloud: NeighborCloud, normals: Tensor, noise: float) -> Tensor:
     """Plane fits to the neighbors that face the same way and lie near the tangent plane, signs kept."""
     k = round(32 * min(1 + 3 * noise, 1.5))
     fitted = []

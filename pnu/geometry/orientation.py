@@ -28,7 +28,7 @@ OPEN = 0.6  # relative misfit of Gauss' law; closed shapes stay below 0.5, a hem
 SOME_NOISE = 0.1  # in spacings, where it is not known
 
 
-class Cloud(NamedTuple):
+class NeighborCloud(NamedTuple):
     """A cloud in its unit sphere, and what local steps need to know of it."""
 
     points: Tensor  # (n, 3) float32
@@ -37,7 +37,7 @@ class Cloud(NamedTuple):
     area: Tensor  # (n,) of the surface that the point stands for
 
     @staticmethod
-    def of(points: Tensor) -> Cloud:
+    def of(points: Tensor) -> NeighborCloud:
         points = points.detach().double()
         points = points - points.mean(0)
         points = (points / points.norm(dim=1).max().clamp_min(1e-30)).float()
@@ -46,23 +46,23 @@ class Cloud(NamedTuple):
         spacing = dist_sq[:, 1:6].sqrt().mean(1)[idx[:, :few]].mean(1)
         area = (dist_sq[:, few - 1] * (torch.pi / (few - 0.5)))[idx[:, :few]].median(1).values
         floor = (0.1 * spacing.median()).clamp_min(1e-6)  # duplicates
-        return Cloud(points, idx, spacing.clamp_min(floor), area.clamp_min(floor**2))
+        return NeighborCloud(points, idx, spacing.clamp_min(floor), area.clamp_min(floor**2))
 
 
-def signs(cloud: Cloud, lines: Tensor) -> Tensor:
+def signs(cloud: NeighborCloud, lines: Tensor) -> Tensor:
     """+1 or -1 for each line, (n,)."""
     if len(lines) <= ANCHORS:
         sign = _global_signs(cloud, lines)
     else:
         anchors = torch.from_numpy(farthest_points_large(cloud.points, ANCHORS)).to(lines.device)
-        sign = _spread(cloud, lines, anchors, _global_signs(Cloud.of(cloud.points[anchors]), lines[anchors]))
+        sign = _spread(cloud, lines, anchors, _global_signs(NeighborCloud.of(cloud.points[anchors]), lines[anchors]))
     for _ in range(3):
         turned = field(cloud, lines * sign[:, None], SOME_NOISE)
         sign = _sign((turned * lines).sum(1))
     return sign
 
 
-def _global_signs(cloud: Cloud, lines: Tensor) -> Tensor:
+def _global_signs(cloud: NeighborCloud, lines: Tensor) -> Tensor:
     weight = cloud.area.sqrt()
     layer = torch.cat([_layer(cloud, lines, rows) for rows in _blocks(lines)]).mul_(weight).mul_(weight[:, None])
     areas = _least_squares(layer, 0.5 * weight, 4)
@@ -78,7 +78,7 @@ def _global_signs(cloud: Cloud, lines: Tensor) -> Tensor:
     return sign
 
 
-def _open_signs(cloud: Cloud, lines: Tensor, areas: Tensor) -> Tensor:
+def _open_signs(cloud: NeighborCloud, lines: Tensor, areas: Tensor) -> Tensor:
     """Of an open sheet, where Gauss' law says little: the signs of least energy from several guesses.
 
     Guesses: the areas' signs, lines followed from point to point, and the sides seen from 13 directions.
@@ -112,14 +112,14 @@ def _blocks(lines: Tensor) -> tuple[Tensor, ...]:
     return torch.split(torch.arange(len(lines), device=lines.device), 128)
 
 
-def _layer(cloud: Cloud, lines: Tensor, rows: Tensor) -> Tensor:
+def _layer(cloud: NeighborCloud, lines: Tensor, rows: Tensor) -> Tensor:
     """Winding number at points `rows` of unit area at each point, (r, n)."""
     points = cloud.points
     along = (points * lines).sum(1) - points[rows] @ lines.T
     return _inverse_distances(cloud, rows, 1.0).pow_(3).mul_(along).div_(4 * torch.pi)
 
 
-def _dipoles(cloud: Cloud, lines: Tensor, width: float) -> Tensor:
+def _dipoles(cloud: NeighborCloud, lines: Tensor, width: float) -> Tensor:
     """Field at each point, along its line, of each point's dipole, times both areas: (n, n), symmetric."""
     points, height = cloud.points, (cloud.points * lines).sum(1)
     blocks = []
@@ -131,7 +131,7 @@ def _dipoles(cloud: Cloud, lines: Tensor, width: float) -> Tensor:
     return torch.cat(blocks).fill_diagonal_(0)
 
 
-def _inverse_distances(cloud: Cloud, rows: Tensor, width: float) -> Tensor:
+def _inverse_distances(cloud: NeighborCloud, rows: Tensor, width: float) -> Tensor:
     """1 / max(distance, width x spacing) of points `rows` from all, (r, n)."""
     size, width_sq = cloud.points.square().sum(1), (width * cloud.spacing) ** 2 / 2
     dist_sq = (size + size[rows, None]).addmm_(cloud.points[rows], cloud.points.T, alpha=-2)
@@ -153,7 +153,7 @@ def _least_squares(matrix: Tensor, target: Tensor, steps: int) -> Tensor:
     return x
 
 
-def _graph(cloud: Cloud, lines: Tensor) -> csr_matrix:
+def _graph(cloud: NeighborCloud, lines: Tensor) -> csr_matrix:
     """Neighbors, both ways, by how much their lines turn and how far they leave each other's tangent plane."""
     n, near = len(lines), cloud.idx[:, 1:13]
     cosine = (lines[:, None] * lines[near]).sum(-1)
@@ -164,7 +164,7 @@ def _graph(cloud: Cloud, lines: Tensor) -> csr_matrix:
     return graph.maximum(graph.T)
 
 
-def _spread(cloud: Cloud, lines: Tensor, anchors: Tensor, sign: Tensor) -> Tensor:
+def _spread(cloud: NeighborCloud, lines: Tensor, anchors: Tensor, sign: Tensor) -> Tensor:
     """Signs of all points from those of the anchors, along paths on which the lines turn least."""
     n = len(lines)
     source = anchors.cpu().numpy()
@@ -186,7 +186,7 @@ def _spread(cloud: Cloud, lines: Tensor, anchors: Tensor, sign: Tensor) -> Tenso
     return agree
 
 
-def field(cloud: Cloud, normals: Tensor, noise: float) -> Tensor:
+def field(cloud: NeighborCloud, normals: Tensor, noise: float) -> Tensor:
     """Minus the gradient of the neighbors' winding number at each point, as unit vectors (n, 3)."""
     width = 1 + 3 * noise
     out = []

@@ -10,7 +10,7 @@ Index = NDArray[np.int64]
 CHUNK = 1 << 21  # entries at a time: bounds the memory
 
 
-def expand(count: Index) -> tuple[Index, Index]:
+def expand_counts(count: Index) -> tuple[Index, Index]:
     """`count[i]` entries for each i: (owner, 0-based number within the owner)."""
     owner = np.repeat(np.arange(len(count)), count)
     return owner, np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)

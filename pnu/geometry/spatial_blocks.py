@@ -55,7 +55,7 @@ class Blocks(NamedTuple):
         return groups
 
 
-def split(points: Points, size: int) -> Blocks:
+def split_blocks(points: Points, size: int) -> Blocks:
     """Blocks of at most `size` of the points (n, 3), by halving the longest side of the box, always at the median."""
     members: list[Index] = []
     boxes: list[tuple[Points, Points]] = []

@@ -37,7 +37,7 @@ def guessed(name: str, values: np.ndarray, suffix: str = "") -> Columns:
     width = values.shape[1]
     if width == 3:
         return Columns([*XYZ])
-    if counts(values[:, 0]):
+    if is_row_number(values[:, 0]):
         names, notes = guessed(name, values[:, 1:], suffix)
         return Columns([SKIP, *names], ("column 1 counts the points: left out", *notes))
     names = [*XYZ, *[""] * (width - 3)]
@@ -70,7 +70,7 @@ def guessed(name: str, values: np.ndarray, suffix: str = "") -> Columns:
     return Columns(names, (f"{said}; columns=x,y,z,... says otherwise",))
 
 
-def counts(values: np.ndarray) -> bool:
+def is_row_number(values: np.ndarray) -> bool:
     """Whether a column says no more than the number of its row."""
     return len(values) > 2 and values[0] in (0, 1) and bool(np.all(np.diff(values) == 1))
 

@@ -91,7 +91,7 @@ def layout_of(path: Path) -> Layout:
             f"{path}: line {first + 1}: commas stand between numbers and within them; write decimal points, or "
             "semicolons between the numbers"
         )
-    cells = fields(rows[0], separator)
+    cells = split_line(rows[0], separator)
     words = [i for i, cell in enumerate(cells) if not is_number(cell.replace(",", ".") if decimal else cell)]
     words = words if len(cells) - len(words) >= 3 else []
     names, at = _names(lines[:first], plain[:first], len(cells), separator)
@@ -114,7 +114,7 @@ def is_number(text: str) -> bool:
     return "_" not in text
 
 
-def fields(line: str, separator: str | None) -> list[str]:
+def split_line(line: str, separator: str | None) -> list[str]:
     """Values of a line; behind a separator at its end there is none."""
     if separator is None:
         return line.replace(",", " ").replace(";", " ").split()
@@ -129,7 +129,7 @@ def _names(
     for at in reversed(range(len(lines))):
         text = plain[at] or COMMENT.sub("", lines[at].replace('"', "")).strip()
         for mark in (separator, ",", ";", "\t", None):
-            found = [UNIT.sub("", cell).strip() for cell in (fields(text, mark) if mark else text.split())]
+            found = [UNIT.sub("", cell).strip() for cell in (split_line(text, mark) if mark else text.split())]
             known = {name.lower() for name in found}
             if any(known.issuperset(names) for names in (*POINTS, *DEGREES)) and (plain[at] or len(found) == width):
                 return _distinct(found), at

@@ -18,7 +18,7 @@ def main(source: str) -> None:
     import numpy as np
     import pye57
 
-    limit_memory(ROOM + 8 * Path(source).stat().st_size)
+    _limit_memory(ROOM + 8 * Path(source).stat().st_size)
     file = pye57.E57(source)
     scans = []
     for number in range(file.scan_count):
@@ -39,7 +39,7 @@ def main(source: str) -> None:
     sys.stdout.buffer.write(buffer.getvalue())
 
 
-def limit_memory(more: int) -> None:
+def _limit_memory(more: int) -> None:
     """Let this process take so many bytes more, where the system has such a limit."""
     try:
         import resource

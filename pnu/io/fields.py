@@ -85,7 +85,7 @@ def arranged(columns: Mapping[str, np.ndarray]) -> Fields:
     return Fields(points, normals, None if colors is None else as_colors(colors), left, tuple(notes))
 
 
-def distinct(names: Collection[str], own: Collection[str], *, length: int = 1000) -> dict[str, str]:
+def distinct_names(names: Collection[str], own: Collection[str], *, length: int = 1000) -> dict[str, str]:
     """Names as they are written: ASCII without blanks, at most so long, and none that another column has.
 
     `own`: the columns of points, normals and colors that the format writes itself. What would be read as one of those,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from pnu.io import las_child
-from pnu.io.fields import GEOGRAPHIC, XYZ, distinct
+from pnu.io.fields import GEOGRAPHIC, XYZ, distinct_names
 
 SLICE = 2**20  # points
 SLICE_BYTES = 2**28  # at most, whatever size of a point a header claims
@@ -151,7 +151,7 @@ def write_las(
     Returns under which name each attribute was written.
     """
     laspy = _laspy(path)
-    names = distinct([name for name in attributes if name != "colors"], (*XYZ, *NORMAL, *COLORS), length=LONGEST)
+    names = distinct_names([name for name in attributes if name != "colors"], (*XYZ, *NORMAL, *COLORS), length=LONGEST)
     header = laspy.LasHeader(version="1.4", point_format=7 if "colors" in attributes else 6)
     header.offsets = np.floor(points.min(0))
     extent = max(float((points.max(0) - header.offsets).max()), 1e-9)

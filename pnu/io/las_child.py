@@ -14,13 +14,13 @@ def main(source: str, points: str) -> None:
     """Write the records of a file to stdout."""
     import laspy
 
-    limit_memory(ROOM + 8 * Path(source).stat().st_size)
+    _limit_memory(ROOM + 8 * Path(source).stat().st_size)
     with laspy.open(source) as file:
         for chunk in file.chunk_iterator(int(points)):
             sys.stdout.buffer.write(chunk.array.tobytes())
 
 
-def limit_memory(more: int) -> None:
+def _limit_memory(more: int) -> None:
     """Let this process take so many bytes more, where the system has such a limit."""
     try:
         import resource

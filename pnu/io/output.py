@@ -7,7 +7,7 @@ import numpy as np
 
 from pnu.io.atomic import atomic_path, check_writable
 from pnu.io.cloud import Cloud
-from pnu.io.fields import COLOR, NORMAL, XYZ, as_colors, distinct
+from pnu.io.fields import COLOR, NORMAL, XYZ, as_colors, distinct_names
 from pnu.io.las import write_las
 from pnu.io.mesh import Geometry, ply_normals, write_obj, write_off, xyz_columns
 from pnu.io.pcd import write_pcd
@@ -103,7 +103,7 @@ def _write_ply(path: Path, cloud: Cloud) -> list[str]:
             more[name] = _storable(values)
         else:
             more |= {f"{name}_{i}": _storable(column) for i, column in enumerate(values.reshape(len(values), -1).T)}
-    names = distinct(more, own)
+    names = distinct_names(more, own)
     write_ply(path, own | {names[name]: values for name, values in more.items()})
     return _renamed(names)
 
@@ -120,7 +120,7 @@ def _write_pcd(path: Path, cloud: Cloud) -> list[str]:
         packed[:, 3] = colors[:, 3] if colors.shape[1] == 4 else 0
         own["rgb" if colors.shape[1] == 3 else "rgba"] = packed.view(np.uint32)[:, 0]
     more = {name: _storable(values) for name, values in cloud.attributes.items() if name != "colors"}
-    names = distinct(more, {*own, *NORMAL, "rgb", "rgba", "_"})
+    names = distinct_names(more, {*own, *NORMAL, "rgb", "rgba", "_"})
     comments = [single.text] if single.text else []
     write_pcd(path, own | {names[name]: values for name, values in more.items()}, comments)
     return [*single.notes, *_renamed(names)]

@@ -208,7 +208,8 @@ def compare_mesh(
 
     Returns `p2f`, and where the cloud has normals `normal_deg`, `normal_unsigned_deg` and `flipped`, against the normal
     of the closest face. Where several faces share the closest point (a point outside a sharp edge), the search chooses
-    which of them counts: `closest` exchanges the search; `raycast.closest_points` is the one that public scripts use.
+    which of them counts: `closest` exchanges the search; `pnu.metrics.ray_casting.closest_points` is the one that
+    public scripts use.
 
     >>> sorted(compare_mesh(np.eye(3), Mesh(np.eye(3), np.array([[0, 1, 2]]))))
     ['p2f']

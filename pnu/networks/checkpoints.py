@@ -1,6 +1,6 @@
 """Run folders: find one, and read the network that it holds.
 
-    outputs/<date>/<time>_<name>/config.yaml             resolved config; its group `model` is for `networks.build`
+    outputs/<date>/<time>_<name>/config.yaml             resolved config; its `model` is for `networks.build_network`
                                  checkpoints/best.ckpt   and last.ckpt: "state_dict" with the network under "model."
                                  run.json                status, versions, git revision, wall time ...
 
@@ -54,7 +54,7 @@ def load(source: str | PathLike[str], allow: Sequence[str] = ()) -> nn.Module:
     if not folder.is_dir():
         raise ValueError(
             f"run={folder}: expected a run folder, such as outputs/<date>/<time>_<name>, or a name of shipped weights"
-            f" ({', '.join(weights.names())}), found no folder"
+            f" ({', '.join(weights.shipped_names())}), found no folder"
         )
     config = run_config(folder)
     network = _unfilled(config["model"], allow)
@@ -62,7 +62,7 @@ def load(source: str | PathLike[str], allow: Sequence[str] = ()) -> nn.Module:
     if isinstance(points, int):
         network.patch_size = points  # type: ignore[assignment]  # radii are fractions of a patch: what it was trained on
     path = checkpoint_path(folder)
-    state = read(path).get("state_dict")
+    state = read_checkpoint(path).get("state_dict")
     if not isinstance(state, Mapping):
         raise ValueError(f"{path}: expected a checkpoint with a 'state_dict', found none")
     fill(network, {key.removeprefix(PREFIX): v for key, v in state.items() if key.startswith(PREFIX)}, path)
@@ -106,7 +106,7 @@ def checkpoint_path(folder: Path) -> Path:
     raise ValueError(f"run={folder}: expected checkpoints/best.ckpt or checkpoints/last.ckpt, found neither")
 
 
-def read(path: str | PathLike[str]) -> dict[str, Any]:
+def read_checkpoint(path: str | PathLike[str]) -> dict[str, Any]:
     """A checkpoint's dict, read as tensors, plain types and NumPy scalars; ValueError if it holds anything else."""
     scalar = np.float64(0).__reduce__()[0]  # what a pickled NumPy scalar calls
     numbers: list[Any] = [(scalar, "numpy.core.multiarray.scalar"), scalar, np.dtype]
@@ -127,7 +127,7 @@ def read(path: str | PathLike[str]) -> dict[str, Any]:
     return content
 
 
-def write(path: str | PathLike[str], content: Mapping[str, Any]) -> None:
+def write_checkpoint(path: str | PathLike[str], content: Mapping[str, Any]) -> None:
     """Write a checkpoint, whole or not at all."""
     buffer = io.BytesIO()  # where torch itself writes to a full disk, its error does not say so
     torch.save(dict(content), buffer)
@@ -161,7 +161,7 @@ def save(folder: Path, network: nn.Module, config: Mapping[str, Any], record: Ma
         (temporary / "checkpoints").mkdir(parents=True)
         (temporary / "config.yaml").write_text(yaml.safe_dump({"model": dict(config)}), encoding="utf-8")
         state = {PREFIX + name: value for name, value in network.state_dict().items()}
-        write(temporary / "checkpoints" / "best.ckpt", {"state_dict": state})
+        write_checkpoint(temporary / "checkpoints" / "best.ckpt", {"state_dict": state})
         write_json(temporary / "run.json", {"status": "finished", "ratio": network.ratio, **record})
         temporary.rename(folder)
     except OSError as error:

@@ -1,13 +1,19 @@
 """Surfaces from points with normals, and how far they lie from the true ones."""
 
-from pnu.reconstruction.screened_poisson import Surface, interpolate, octree_depth, reconstruct, trim
+from pnu.reconstruction.screened_poisson import (
+    ReconstructedSurface,
+    interpolated_values,
+    octree_depth,
+    reconstruct,
+    trim,
+)
 from pnu.reconstruction.surface_errors import SurfaceErrors, check_frame, surface_errors
 
 __all__ = [
-    "Surface",
+    "ReconstructedSurface",
     "SurfaceErrors",
     "check_frame",
-    "interpolate",
+    "interpolated_values",
     "octree_depth",
     "reconstruct",
     "surface_errors",

@@ -27,7 +27,7 @@ FAR = 3.0  # in spacings: a point, or a piece of surface, that far from any othe
 BOX = 1.1  # side of Open3D's octree over that of the points' bounding box
 
 
-class Surface(NamedTuple):
+class ReconstructedSurface(NamedTuple):
     """A reconstructed surface."""
 
     mesh: Mesh  # outward, where it is closed
@@ -60,7 +60,7 @@ class Surface(NamedTuple):
 
 def reconstruct(
     points: np.ndarray, normals: np.ndarray, *, depth: int | None = None, timeout: float = 600, name: str = "cloud"
-) -> Surface:
+) -> ReconstructedSurface:
     """The surface through points `(n, 3)` along normals `(n, 3)`; those of no length are estimated. In their frame.
 
     The work is done by a child process, which may crash or hang without loss. The same input gives the same mesh.
@@ -94,7 +94,7 @@ def reconstruct(
     away = (given[some] * face_normals(mesh)[face]).sum(1) * (-1 if inside_out else 1) < 0
     alone = cKDTree(points).query(mesh.vertices, distance_upper_bound=far)[0] > far
     shares = (float(np.mean(share)) for share in (off > far, alone, away))
-    return Surface(mesh, found["density"], depth, inside_out, *shares)
+    return ReconstructedSurface(mesh, found["density"], depth, inside_out, *shares)
 
 
 def octree_depth(points: np.ndarray) -> int:
@@ -137,7 +137,7 @@ def failure(code: int, stderr: str, depth: int) -> str:
     return f"Poisson reconstruction at depth={depth} {reason}; {memory}: try again or with depth={max(depth - 1, 1)}"
 
 
-def trim(surface: Surface, quantile: float) -> Surface:
+def trim(surface: ReconstructedSurface, quantile: float) -> ReconstructedSurface:
     """Without the vertices whose density is below that quantile, 0 <= quantile < 1, and the faces that use them.
 
     For open surfaces, around which Poisson reconstruction blows a bubble: no points are there, so its density is low.
@@ -154,7 +154,7 @@ def trim(surface: Surface, quantile: float) -> Surface:
     return surface._replace(mesh=Mesh(surface.mesh.vertices[used], number[faces]), density=surface.density[used])
 
 
-def interpolate(points: np.ndarray, values: np.ndarray, query: np.ndarray, k: int = 4) -> Array:
+def interpolated_values(points: np.ndarray, values: np.ndarray, query: np.ndarray, k: int = 4) -> Array:
     """Values `(n, c)` of points `(n, 3)`, such as colors, at `query` `(m, 3)`: k nearest, by inverse distance."""
     far, near = cKDTree(points).query(query, k=np.arange(1, min(k, len(points)) + 1))
     weight = 1 / (far + 1e-9 * (far.max() or 1.0))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pnu.geometry.ragged import chunks, expand
+from pnu.geometry.ragged import chunks, expand_counts
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -52,14 +52,14 @@ def triangles(corners: Array, height: int, width: int) -> Fragments:
     first = np.clip(np.ceil(corners[:, :, 1].min(1) - 0.5), 0, height).astype(np.int64)
     last = np.clip(np.ceil(corners[:, :, 1].max(1) - 0.5), 0, height).astype(np.int64)
     for part in chunks(last - first):
-        face, step = expand((last - first)[part])
+        face, step = expand_counts((last - first)[part])
         face += part.start
         row = first[face] + step
         left, right = spans(corners[face], row + 0.5)
         left = np.clip(np.ceil(left - 0.5), 0, width).astype(np.int64)
         length = np.maximum(np.clip(np.ceil(right - 0.5), 0, width).astype(np.int64) - left, 0)
         for inner in chunks(length):
-            span, step = expand(length[inner])
+            span, step = expand_counts(length[inner])
             span += inner.start
             column, line, of = left[span] + step, row[span], face[span]
             z = start[of] + slope[of, 0] * (column + 0.5) + slope[of, 1] * (line + 0.5)
@@ -108,7 +108,7 @@ def balls(center: Array, radius: float, height: int, width: int) -> Fragments:
     first = np.ceil(center[:, :2] - radius - 0.5).astype(np.int64)
     side = int(np.ceil(2 * radius)) + 1
     for part in chunks(np.full(len(center), side * side)):
-        owner, step = expand(np.full(part.stop - part.start, side * side))
+        owner, step = expand_counts(np.full(part.stop - part.start, side * side))
         owner += part.start
         column, row = first[owner, 0] + step % side, first[owner, 1] + step // side
         rise_sq = radius**2 - (column + 0.5 - center[owner, 0]) ** 2 - (row + 0.5 - center[owner, 1]) ** 2

@@ -40,7 +40,7 @@ def render_cloud(
     if not len(points) or not np.isfinite(points).all():
         raise ValueError(f"picture: expected finite points, found {len(points)} points, NaN or infinity among them")
     pixels = size * supersample
-    center = project(camera, points, pixels)
+    center = to_pixels(camera, points, pixels)
     step = spacing(points) / camera.half_size * pixels / 2
     ball = 0.4 * step if radius is None else radius / camera.half_size * pixels / 2
     ball = max(ball, 0.9 * supersample)
@@ -79,7 +79,7 @@ def render_mesh(
             f"picture: expected a mesh with finite vertices, found {len(vertices)} vertices, {len(faces)} faces"
         )
     pixels = size * supersample
-    corners = project(camera, vertices, pixels)[faces]
+    corners = to_pixels(camera, vertices, pixels)[faces]
     (ax, ay), (bx, by) = ((corners[:, i] - corners[:, 0]).T[:2] for i in (1, 2))
     back = ax * by - ay * bx > 0  # y grows downwards: a face seen from outside turns clockwise
     order = np.argsort(~back, kind="stable")  # where a fold has two faces at one depth, the one that looks here is seen
@@ -109,18 +109,20 @@ def develop(
     )
     shape = (bottom - top, right - left)  # the part of the picture that is not white, in whole pixels of the result
     at = (row - top, column - left)
-    surface = shading.Surface(np.zeros(shape, bool), *(np.zeros((*shape, *k), np.float32) for k in ((), (3,), (3,))))
+    surface = shading.PixelSurface(
+        np.zeros(shape, bool), *(np.zeros((*shape, *k), np.float32) for k in ((), (3,), (3,)))
+    )
     surface.covered[at] = True
     surface.depth[at] = depth
     surface.normal[at] = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     surface.color[at] = color
     picture = np.full((pixels // supersample, pixels // supersample, 3), 255, np.uint8)
     part = np.s_[top // supersample : bottom // supersample, left // supersample : right // supersample]
-    picture[part] = shading.resolve(shading.shade(surface, pixels), surface.covered, supersample)
+    picture[part] = shading.averaged_pixels(shading.shade(surface, pixels), surface.covered, supersample)
     return picture
 
 
-def project(camera: Camera, points: Array, pixels: int) -> Array:
+def to_pixels(camera: Camera, points: Array, pixels: int) -> Array:
     """Points `(n, 3)` in a picture of `pixels` x `pixels`: x right, y down, z towards the viewer, all in pixels."""
     return camera.view(points) * [pixels / 2, -pixels / 2, pixels / 2] + [pixels / 2, pixels / 2, 0]
 

@@ -18,7 +18,7 @@ DIRECTIONS = 8
 Image = NDArray[np.float32]
 
 
-class Surface(NamedTuple):
+class PixelSurface(NamedTuple):
     """What each pixel shows. Where `covered` is False the rest means nothing."""
 
     covered: NDArray[np.bool_]  # (h, w)
@@ -27,7 +27,7 @@ class Surface(NamedTuple):
     color: Image  # (h, w, 3) sRGB in 0..1
 
 
-def shifted(image: Image, rows: int, columns: int, fill: float) -> Image:
+def shifted_image(image: Image, rows: int, columns: int, fill: float) -> Image:
     """result[r, c] = image[r + rows, c + columns], `fill` beyond the border."""
     result = np.full_like(image, fill)
     h, w = image.shape
@@ -38,7 +38,7 @@ def shifted(image: Image, rows: int, columns: int, fill: float) -> Image:
     return result
 
 
-def openness(surface: Surface, side: float) -> Image:
+def openness(surface: PixelSurface, side: float) -> Image:
     """Share of the sky over each pixel that nearby surface leaves free, `(h, w)` in 0..1: horizons in a few directions.
 
     side: of the whole picture, in pixels.
@@ -52,7 +52,7 @@ def openness(surface: Surface, side: float) -> Image:
         horizon = np.zeros_like(depth)
         for part in REACH:
             columns, rows = (round(part * side * f(turn)) for f in (np.cos, np.sin))
-            rise = shifted(depth, rows, columns, far) - depth
+            rise = shifted_image(depth, rows, columns, far) - depth
             distance = np.sqrt(np.float32(rows**2 + columns**2) + rise**2)
             n = surface.normal
             sine = (columns * n[..., 0] - rows * n[..., 1] + rise * n[..., 2]) / distance
@@ -63,7 +63,7 @@ def openness(surface: Surface, side: float) -> Image:
     return 1 - blocked
 
 
-def shade(surface: Surface, side: float) -> Image:
+def shade(surface: PixelSurface, side: float) -> Image:
     """Colors `(h, w, 3)`, linear light in 0..1."""
     n = surface.normal
     light = np.zeros(n.shape[:2], np.float32)
@@ -78,7 +78,7 @@ def shade(surface: Surface, side: float) -> Image:
     return linear_light(surface.color) * light[..., None] + (GLOSS * gloss * free)[..., None]
 
 
-def resolve(linear: Image, covered: NDArray[np.bool_], supersample: int) -> NDArray[np.uint8]:
+def averaged_pixels(linear: Image, covered: NDArray[np.bool_], supersample: int) -> NDArray[np.uint8]:
     """Average supersample x supersample pixels over white, as 8-bit sRGB."""
     linear = np.where(covered[..., None], linear, 1).clip(0, 1)
     h, w = covered.shape[0] // supersample, covered.shape[1] // supersample

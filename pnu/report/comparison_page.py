@@ -1,20 +1,17 @@
 """Several methods beside each other: tables, surfaces with their errors, figures and 3D views on one page."""
 
 from collections.abc import Callable, Mapping, Sequence
-from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
-
-from PIL import Image
 
 from pnu import rendering
 from pnu.benchmark import Row, write_results
 from pnu.metrics import METRICS, Metric
 from pnu.report import offline_page
 from pnu.report.comparison_tables import tables
-from pnu.report.shape_views import Look, Rebuilt, Shown, figure, points_for, rebuild, surface_rows, view
+from pnu.report.shape_views import Look, Rebuilt, ShownCase, points_for, rebuild, shape_figure, surface_rows, view
 
-__all__ = ["Look", "Shown", "Written", "write_comparison"]
+__all__ = ["Look", "ShownCase", "Written", "write_comparison"]
 
 
 LOOK = Look()
@@ -31,7 +28,7 @@ class Written(NamedTuple):
 def write_comparison(
     folder: Path,
     rows: Sequence[Row],
-    shown: Sequence[Shown],
+    shown: Sequence[ShownCase],
     *,
     title: str,
     head: Sequence[str],
@@ -69,9 +66,9 @@ def write_comparison(
         notes += said
         surfaces += surface_rows(one.case, made)
         if made or not rebuilt_kinds:
-            picture = figure(one, made, look)
+            picture = shape_figure(one, made, look)
             rendering.save_png(folder / "figures" / f"{shape}_{kind}.png", picture)
-            drawn[f"{shape}, {kind}"] = webp(picture)
+            drawn[f"{shape}, {kind}"] = rendering.webp(picture)
     vertices = sum(len(surface.mesh.vertices) for made in rebuilt for surface in made.values())
     points = points_for(page_mb, sum(len(one.clouds) + 1 for one in shown), vertices)
     largest = max((len(cloud) for one in shown for cloud in (*one.clouds.values(), one.case.truth.samples)), default=0)
@@ -89,10 +86,3 @@ def write_comparison(
         colormap=look.colormap,
     )
     return Written(size, points, notes)
-
-
-def webp(picture: Any) -> bytes:
-    """A tenth of the PNG's bytes, no difference to be seen."""
-    buffer = BytesIO()
-    Image.fromarray(picture).save(buffer, "WEBP", quality=90, method=4)
-    return buffer.getvalue()

@@ -43,7 +43,7 @@ def means(rows: Sequence[Row], shapes: int, metrics: Sequence[Metric]) -> offlin
     heads = [offline_page.Column(shown.head or shown.title, shown.form, better=shown.better) for shown in all_shown]
     body = [
         offline_page.Row(
-            summary["method"], [scaled(summary, shown) for shown in all_shown], summary["method"] in REFERENCES
+            summary["method"], [table_value(summary, shown) for shown in all_shown], summary["method"] in REFERENCES
         )
         for summary in summarize(rows, metrics)
     ]
@@ -58,7 +58,7 @@ def table_1(rows: Sequence[Row], shapes: Sequence[str]) -> offline_page.Table:
     body = [
         offline_page.Row(
             method,
-            [scaled(by_place.get((method, shape), {}), shown) for shown in both for shape in shapes],
+            [table_value(by_place.get((method, shape), {}), shown) for shown in both for shape in shapes],
             method in REFERENCES,
         )
         for method in dict.fromkeys(row["method"] for row in rows)
@@ -82,7 +82,7 @@ def surface_table(rows: Sequence[Row]) -> offline_page.Table:
     return offline_page.Table(caption, heads, references_last(body))
 
 
-def scaled(row: Mapping[str, Any], shown: Shown) -> float | None:
+def table_value(row: Mapping[str, Any], shown: Shown) -> float | None:
     """A value times the factor of its table."""
     return shown.factor * row[shown.name] if shown.name in row else None
 

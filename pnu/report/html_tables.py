@@ -68,7 +68,7 @@ def typeset(table: Table) -> Set:
         numbers = [row.values[i] for row in table.rows if not row.reference]
         known = [number for number in numbers if number is not None and math.isfinite(number)]
         choose = max if column.better == "higher" else min
-        best.append(shown(choose(known), column.form) if column.best and known else None)
+        best.append(cell_text(choose(known), column.form) if column.best and known else None)
     groups: list[tuple[str, int]] = []
     if any(column.group for column in table.columns):
         names = (column.group for column in table.columns)
@@ -77,14 +77,14 @@ def typeset(table: Table) -> Set:
     for row in table.rows:
         cells = []
         for number, column, winner in zip(row.values, table.columns, best, strict=True):
-            text = shown(number, column.form)
+            text = cell_text(number, column.form)
             kind = "best" if winner is not None and text == winner and not row.reference else ""
             cells.append(Cell(text, sort_key(number), kind))
         rows.append(Line(row.name, cells, row.reference))
     return Set(table.caption, "method", [column.head for column in table.columns], rows, groups)
 
 
-def shown(number: float | None, form: str) -> str:
+def cell_text(number: float | None, form: str) -> str:
     """A number as a cell shows it."""
     return "-" if number is None or not math.isfinite(number) else format(number, form)
 

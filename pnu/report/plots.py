@@ -153,7 +153,7 @@ def logarithmic(axis: "Axis", values: Iterable[float]) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def scaled(study: Study, metric: str, values: Iterable[float]) -> list[float]:
+def axis_values(study: Study, metric: str, values: Iterable[float]) -> list[float]:
     """Values in the unit of a metric's axis."""
     return [study.shown(metric).factor * value for value in values]
 
@@ -164,10 +164,10 @@ def settings_panel(study: Study, metric: str) -> Panel:
     def draw(axes: "Axes") -> None:
         summary = study.summary(study.baseline, metric) if study.baseline else None
         if summary is not None and summary.spread is not None:
-            mean, spread = scaled(study, metric, [summary.mean, summary.spread])
+            mean, spread = axis_values(study, metric, [summary.mean, summary.spread])
             axes.axhspan(mean - spread, mean + spread, color="#dfe8f3", zorder=0)
         for i, setting in enumerate(study.settings):
-            values = scaled(study, metric, setting.of(metric))
+            values = axis_values(study, metric, setting.of(metric))
             axes.plot([i] * len(values), values, "o", color=color(i), markersize=4, alpha=0.8)
             if values:
                 mean = sum(values) / len(values)
@@ -189,8 +189,8 @@ def effect_panel(study: Study, key: str, metric: str) -> Panel:
         log = len(positive) > 1 and max(positive) / min(positive) > 20 and min(values) >= 0
         # on a logarithmic axis zero has a place of its own, left of the others
         place = {value: value if value > 0 or not log else min(positive) / 10 for value in values}
-        means = scaled(study, metric, [setting.mean(metric) for _, setting in pairs])
-        spreads = scaled(study, metric, [spread_of(study, setting, metric) for _, setting in pairs])
+        means = axis_values(study, metric, [setting.mean(metric) for _, setting in pairs])
+        spreads = axis_values(study, metric, [spread_of(study, setting, metric) for _, setting in pairs])
         if len(set(values)) == len(values) <= 8:
             axes.plot([place[value] for value in values], means, color="#9aa3ad", zorder=1)
         for (value, setting), mean, spread in zip(pairs, means, spreads, strict=True):
@@ -264,7 +264,10 @@ def pareto_panel(study: Study, normals: str) -> Panel:
 
     def draw(axes: "Axes") -> None:
         places = {
-            i: (scaled(study, "chamfer_sq", [s.mean("chamfer_sq")])[0], scaled(study, normals, [s.mean(normals)])[0])
+            i: (
+                axis_values(study, "chamfer_sq", [s.mean("chamfer_sq")])[0],
+                axis_values(study, normals, [s.mean(normals)])[0],
+            )
             for i, s in enumerate(study.settings)
             if s.of(normals) and s.of("chamfer_sq")
         }

@@ -22,14 +22,14 @@ BYTES_POINT, BYTES_VERTEX = 12.0, 21.0  # in a page, packed
 FEWEST = 1000  # points of a cloud that still show a shape
 
 
-class Shown(NamedTuple):
+class ShownCase(NamedTuple):
     """A case with what the methods made of it; "input" comes first, with estimated normals if it had none."""
 
     case: Case
     clouds: dict[str, NDArray[np.float32]]  # (n, 3) or (n, 6)
 
     @classmethod
-    def of(cls, case: Case) -> "Shown":
+    def of(cls, case: Case) -> "ShownCase":
         return cls(case, {"input": np.hstack([case.points, normals_of(case)]).astype(np.float32)})
 
 
@@ -50,14 +50,14 @@ class Rebuilt(NamedTuple):
     errors: reconstruction.SurfaceErrors
 
 
-def rebuild(shown: Shown, seed: int = 0) -> tuple[dict[str, Rebuilt], list[str]]:
+def rebuild(shown: ShownCase, seed: int = 0) -> tuple[dict[str, Rebuilt], list[str]]:
     """The surface of each cloud with normals, measured against the truth; and what went wrong, a line each."""
     made, notes = {}, []
     truth = shown.case.truth
     if truth.mesh is None:
         return {}, [f"{truth.shape}: has no true mesh to measure surfaces against"]
 
-    def surface_of(cloud: np.ndarray) -> reconstruction.Surface | str:
+    def surface_of(cloud: np.ndarray) -> reconstruction.ReconstructedSurface | str:
         try:
             return reconstruction.reconstruct(cloud[:, :3], cloud[:, 3:])
         except ValueError as error:
@@ -83,7 +83,7 @@ def error_limit(errors: Sequence[np.ndarray]) -> float:
     return float(np.median([typical_limit(error) for error in errors])) if errors else 1e-2
 
 
-def view(shown: Shown, rebuilt: Mapping[str, Rebuilt], points: int) -> offline_page.View:
+def view(shown: ShownCase, rebuilt: Mapping[str, Rebuilt], points: int) -> offline_page.View:
     """For the page's viewer: at most `points` points of each cloud, every k-th."""
     truth = shown.case.truth
     drawings, errors = [], []
@@ -120,7 +120,7 @@ def points_for(size_mb: float, clouds: int, vertices: int) -> int:
     return points
 
 
-def figure(shown: Shown, rebuilt: Mapping[str, Rebuilt], look: Look) -> NDArray[np.uint8]:
+def shape_figure(shown: ShownCase, rebuilt: Mapping[str, Rebuilt], look: Look) -> NDArray[np.uint8]:
     """The paper's figure of one shape: clouds by normals; where rebuilt, surfaces; and the surfaces by error."""
     truth = shown.case.truth
     camera = rendering.look_at(truth.samples, azimuth=look.azimuth, elevation=look.elevation, up=look.up)

@@ -6,9 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from PIL import Image
-
+from pnu import rendering
 from pnu.config.quoting import retyped
 from pnu.io import atomic_path
 from pnu.report import offline_page
@@ -29,7 +27,7 @@ def write_report(study: Study, folder: Path) -> list[Path]:
     """Write report.md, report.html, summary.csv, runs.csv and the figures, each atomically; their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     drawn = plots(study)
-    pictures = {shape: webp(picture) for shape, picture in sheets(study).items()}
+    pictures = {shape: rendering.webp(picture, quality=80) for shape, picture in sheets(study).items()}
     contents: dict[str, bytes] = {
         "report.md": markdown(study, drawn, list(pictures)).encode(),
         "report.html": page_html(study, drawn, pictures).encode(),
@@ -43,13 +41,6 @@ def write_report(study: Study, folder: Path) -> list[Path]:
         with atomic_path(folder / name) as temporary:
             temporary.write_bytes(content)
     return [folder / name for name in contents]
-
-
-def webp(picture: np.ndarray) -> bytes:
-    """A picture as WebP."""
-    buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, "WEBP", quality=80)
-    return buffer.getvalue()
 
 
 def facts(study: Study) -> list[str]:

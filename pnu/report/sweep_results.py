@@ -11,7 +11,7 @@ import yaml
 from pnu.config.compose import flatten
 from pnu.config.quoting import shell_line
 from pnu.io import read_json
-from pnu.training.closing_lines import described, shown_in
+from pnu.training.closing_lines import own_metrics, shown_in
 from pnu.training.run_folder import UNHASHED, UNHASHED_DATA, RunFolder
 from pnu.training.sweeps import runs
 
@@ -82,7 +82,7 @@ class Study(NamedTuple):
     @property
     def described(self) -> dict[str, Any]:
         """How the metrics of one's own are shown, as the runs' records say."""
-        return {name: entry for s in self.settings for run in s.runs for name, entry in described(run.folder).items()}
+        return {name: entry for s in self.settings for run in s.runs for name, entry in own_metrics(run.folder).items()}
 
     @property
     def metrics(self) -> list[str]:
@@ -123,7 +123,7 @@ def collect(folder: str | Path, baseline: str | None = None) -> Study:
         raise ValueError(
             f"sweep={folder}: no such folder; expected one that a sweep made ({shell_line('train', '-m')} ...)"
         )
-    found = [read(run) for run in runs(folder)]
+    found = [read_run(run) for run in runs(folder)]
     finished = [run for run in found if run.metrics]
     if not finished:
         raise ValueError(f"sweep={folder}: expected finished runs below it, found {len(found)} runs, none finished")
@@ -138,7 +138,7 @@ def collect(folder: str | Path, baseline: str | None = None) -> Study:
     return Study(folder, settings, [run for run in found if not run.metrics], search)
 
 
-def read(folder: RunFolder) -> Run:
+def read_run(folder: RunFolder) -> Run:
     """A run of a sweep, from its folder."""
     record = folder.read_record()
     config = yaml.safe_load(folder.config.read_text("utf-8")) if folder.config.exists() else {}

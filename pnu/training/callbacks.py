@@ -21,7 +21,7 @@ from torch.utils.tensorboard.summary import hparams
 
 from pnu.config.instantiate import PACKAGES, find_class, instantiate
 from pnu.config.signature import arguments
-from pnu.networks.checkpoints import read, write
+from pnu.networks.checkpoints import read_checkpoint, write_checkpoint
 from pnu.rendering import figure, look_at, render_cloud, save_png
 from pnu.rendering.colors import normal_colors
 from pnu.runtime.progress import bar
@@ -34,10 +34,10 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     """Writes checkpoints that appear whole or not at all; reads tensors and plain types only."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        write(path, checkpoint)
+        write_checkpoint(path, checkpoint)
 
     def load_checkpoint(self, path: Any, map_location: Any = "cpu", weights_only: bool | None = True) -> dict[str, Any]:
-        return read(path)
+        return read_checkpoint(path)
 
 
 class Checkpoints(pl.Callback):
@@ -319,7 +319,7 @@ class Pictures(pl.Callback):
                     writer.add_mesh(
                         f"{sample['shape']}/{name}",
                         shown[None, :, :3],
-                        normal_colors(unit(shown))[None],
+                        normal_colors(shown_normals(shown))[None],
                         config_dict={"material": {"cls": "PointsMaterial", "size": point_size(shown[:, :3])}},
                         global_step=self.drawn,
                     )
@@ -336,7 +336,7 @@ class Pictures(pl.Callback):
         for camera in (look_at(clouds["target"]), look_at(*clouds.values())):
             try:
                 panels = [
-                    render_cloud(cloud[:, :3], normal_colors(unit(cloud)), camera=camera, size=self.size)
+                    render_cloud(cloud[:, :3], normal_colors(shown_normals(cloud)), camera=camera, size=self.size)
                     for cloud in clouds.values()
                 ]
                 return figure(panels, list(clouds))
@@ -393,7 +393,7 @@ def board(trainer: pl.Trainer) -> Any:
     return next((x.experiment for x in trainer.loggers if isinstance(x, TensorBoardLogger)), None)
 
 
-def unit(cloud: np.ndarray) -> np.ndarray:
+def shown_normals(cloud: np.ndarray) -> np.ndarray:
     """Unit normals (n, 3) of a cloud (n, 6); zeros, shown gray, for a cloud without normals."""
     if cloud.shape[1] < 6:
         return np.zeros((len(cloud), 3))
@@ -422,7 +422,7 @@ def build_all(config: Mapping[str, Any], run: RunFolder) -> list[pl.Callback]:
 def build_loggers(config: Mapping[str, Any], run: RunFolder) -> list[Logger]:
     """The loggers of a training. What TensorBoard's has after a run's last checkpoint is taken back."""
     groups = config["logger"] or {}
-    purge = {"purge_step": read(run.last)["global_step"]} if run.last.exists() else {}
+    purge = {"purge_step": read_checkpoint(run.last)["global_step"]} if run.last.exists() else {}
     found = []
     for group in [groups] if "_target_" in groups else groups.values():  # runs of earlier versions have one, unnamed
         kind = str(group["_target_"]).rpartition(".")[2]

@@ -30,7 +30,7 @@ def objective(config: Mapping[str, Any], run: RunFolder) -> list[float] | None:
     return [found[name] for name in config["objective"]]
 
 
-def described(run: RunFolder) -> dict[str, Any]:
+def own_metrics(run: RunFolder) -> dict[str, Any]:
     """How the metrics of one's own that a run measured are shown, by name, as its record says."""
     found = run.read_record().get("metrics")
     return found if isinstance(found, dict) else {}
@@ -49,16 +49,16 @@ def shown_in(results: Iterable[Mapping[str, Any]], own: Mapping[str, Any]) -> li
 def job_line(run: RunFolder) -> str:
     """The test metrics of one job of a sweep."""
     test = read_json(run.metrics)["test"]
-    parts = [f"{shown.title} {shown.text(test[shown.name])}" for shown in shown_in([test], described(run))]
+    parts = [f"{shown.title} {shown.text(test[shown.name])}" for shown in shown_in([test], own_metrics(run))]
     return f"job {run.facts['job']} finished: {run}: {', '.join(parts)}"
 
 
-def closing(run: RunFolder) -> str:
+def closing_lines(run: RunFolder) -> str:
     """The metrics of a run as a table, its folder, and the command to go on with."""
     found = read_json(run.metrics)
     columns = [name for name in TITLES if name in found]
     rows = [["each patch in its unit sphere", *(TITLES[name] for name in columns)]]
-    for shown in shown_in([found[column] for column in columns], described(run)):
+    for shown in shown_in([found[column] for column in columns], own_metrics(run)):
         rows.append([shown.title, *(shown.text(found[column].get(shown.name)) for column in columns)])
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = [

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from pnu.fast import accelerate
 from pnu.metrics import METRICS, CloudMetrics, Metric
-from pnu.networks.checkpoints import write
+from pnu.networks.checkpoints import write_checkpoint
 from pnu.networks.norm import synchronize
 from pnu.upsamplers import dense_patches
 
@@ -207,7 +207,9 @@ class UpsamplingModule(pl.LightningModule):
         kept = here or self.micro_batches  # of a gradient alone any of them may be the cause
         path = Path(self.trainer.default_root_dir) / f"nonfinite_step{self.global_step}_rank{self.global_rank}.pt"
         terms = {name: float(value) for name, value in (kept[0][0] if here else values).items()}
-        write(path, {"step": self.global_step, "terms": terms, "batch": joined([batch for _, batch in kept])})
+        write_checkpoint(
+            path, {"step": self.global_step, "terms": terms, "batch": joined([batch for _, batch in kept])}
+        )
         first = next((name for name in broken if name != "loss"), broken[0])
         raise NonFinite(
             f"step {self.global_step}: {first} is {float(values[first])}; the batch is in {path};"

@@ -5,7 +5,7 @@ import warnings
 from typing import Any
 
 
-def arguments(hydra: Any) -> list[str]:
+def search_arguments(hydra: Any) -> list[str]:
     """What the command line of a sweep gets added so that a search started again goes on.
 
     The trials still to do are those that the config wants less those that have ended; a trial that was interrupted

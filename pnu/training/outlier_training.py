@@ -74,7 +74,7 @@ def examples_of(meshes: Sequence[Mesh], seed: int) -> Examples:
     return Examples(*(torch.cat(parts) for parts in zip(*found, strict=True)))
 
 
-def train(examples: Examples, *, steps: int = 4000, lr: float = 4e-3, seed: int = 0) -> OutlierDetector:
+def train_detector(examples: Examples, *, steps: int = 4000, lr: float = 4e-3, seed: int = 0) -> OutlierDetector:
     """A detector trained on examples, as many strays in each step as there are good points to three."""
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
@@ -109,10 +109,10 @@ def main() -> None:
     parser.add_argument("--leave", nargs="*", default=[], help="names of meshes that are not trained on")
     parser.add_argument("--seed", type=int, default=0, help="of all that is drawn")
     arguments = parser.parse_args()
-    meshes = {name: shapes.unit(read_mesh(path)) for name, path in meshes_of(arguments.meshes).items()}
+    meshes = {name: shapes.unit_mesh(read_mesh(path)) for name, path in meshes_of(arguments.meshes).items()}
     meshes |= {name: shapes.make(name) for name in shapes.names()}
     chosen = [mesh for name, mesh in meshes.items() if name not in arguments.leave]
-    network = train(examples_of(chosen, arguments.seed), seed=arguments.seed)
+    network = train_detector(examples_of(chosen, arguments.seed), seed=arguments.seed)
     with atomic_path(arguments.output) as temporary:
         temporary.write_bytes(save({name: value.contiguous() for name, value in network.state_dict().items()}))
 

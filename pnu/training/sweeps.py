@@ -34,7 +34,7 @@ def sweep_name(overrides: Sequence[str], program: str) -> str:
     return "_".join([*(given or [program]), hashlib.sha256(" ".join(kept).encode()).hexdigest()[:6]])
 
 
-def arguments(overrides: Sequence[str], program: str) -> list[str]:
+def sweep_arguments(overrides: Sequence[str], program: str) -> list[str]:
     """What a sweep's command line gets added: its name, and which keys are the same in all jobs."""
     parsed = parse(list(overrides))
     added = []
@@ -168,7 +168,7 @@ def run(start: Callable[[], None], folder: Path) -> None:
         code = stop.code
     if code == INTERRUPTED:
         record_interruptions(folder)
-    print(closing(folder), flush=True)
+    print(closing_line(folder), flush=True)
     if code == INTERRUPTED:
         print(f"stopped; go on with: {typed_line()}", file=sys.stderr, flush=True)
     ended = [run for run in runs(folder) if run.record_path.stat().st_mtime > began]
@@ -220,7 +220,7 @@ def runs(sweep: Path) -> list[RunFolder]:
     return sorted(folders, key=lambda run: read_json(run.record_path).get("job") or 0)
 
 
-def closing(sweep: Path) -> str:
+def closing_line(sweep: Path) -> str:
     """What a sweep prints at its end."""
     states = [state(run) for run in runs(sweep)]
     counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))

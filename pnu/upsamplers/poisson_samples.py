@@ -35,7 +35,7 @@ class PoissonSurface:
         mesh = _near(mesh, cloud[:, :3], self.FAR)
         rng = np.random.default_rng(int(torch.randint(2**62, (1,), generator=context.generator)))
         points = sample_poisson_disk(mesh, count, rng)[:, :3]
-        normals = reconstruction.interpolate(mesh.vertices, vertex_normals(mesh), points, k=3)
+        normals = reconstruction.interpolated_values(mesh.vertices, vertex_normals(mesh), points, k=3)
         return torch.from_numpy(np.hstack([points, normals])).to(cloud)
 
 

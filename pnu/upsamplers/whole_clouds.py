@@ -222,7 +222,7 @@ def normals(points: np.ndarray, neighbors: int = 16, *, progress: Progress = sil
     return found
 
 
-def source(model: str | PathLike[str], normals: np.ndarray | None) -> str | PathLike[str]:
+def weights_source(model: str | PathLike[str], normals: np.ndarray | None) -> str | PathLike[str]:
     """What `checkpoint.load` takes, for a cloud with these normals: "surface" means one of two, "newest" a run."""
     if model == "surface" and normals is None:
         return "surface_estimated"
@@ -282,7 +282,7 @@ def _model(model: Any, normals: np.ndarray | None) -> tuple[Any, bool]:
     """The network or upsampler that is meant, and whether it is the caller's own."""
     if not isinstance(model, str | PathLike):
         return model, True
-    return (classical(str(model)) if model in CLASSICAL else checkpoints.load(source(model, normals))), False
+    return (classical(str(model)) if model in CLASSICAL else checkpoints.load(weights_source(model, normals))), False
 
 
 def _on_device(model: Any, given: bool, device: str) -> tuple[Any, torch.device]:

@@ -15,19 +15,19 @@ SUFFIX = ".safetensors"
 class Weights(NamedTuple):
     """A trained network."""
 
-    model: dict[str, Any]  # what `networks.build` takes
+    model: dict[str, Any]  # what `networks.build_network` takes
     patch_size: int | None  # points of the patches that it was trained on; None: the network's default
     state: dict[str, Tensor]
 
 
-def names() -> list[str]:
+def shipped_names() -> list[str]:
     """Names of the weights that come with pnu."""
     return sorted(path.stem for path in FOLDER.glob(f"*{SUFFIX}"))
 
 
 def find(source: str | PathLike[str]) -> Path | None:
     """The file of weights that `source` means: a shipped name, or a path of such a file; None if neither."""
-    if str(source) in names():
+    if str(source) in shipped_names():
         return FOLDER / f"{source}{SUFFIX}"
     path = Path(source)
     return path if path.suffix == SUFFIX and path.is_file() else None
