@@ -2,7 +2,7 @@
 
 Each mesh of the folder, brought to the unit sphere, is scanned in every way of `pnu.data.scanner`; each method makes a
 cloud of four times as many points of the scan. "pnu" is `pnu.upsample` as it is called by default; "pnu, as it is" the
-same without cleaning; "open3d" what users of Open3D do: statistical outlier removal, normals, consistent tangent planes,
+same without cleaning; "open3d" what users of Open3D do: statistical outlier removal, normals, consistent tangent
 planes, Poisson, the least dense 3 % trimmed, Poisson-disk samples. The clouds go to OUTPUT/METHOD/SHAPE_KIND.ply.
 """
 

@@ -27,6 +27,10 @@ class Reconstruct:
     )
     depth: int | None = doc("of the octree, 8 is usual, one more is twice as fine; null: from the points' spacing")
     trim: float = doc("share of the least supported vertices to cut off, for open surfaces, such as 0.05")
+    reach: float | None = doc(
+        "what lies farther from all points than so many of their spacings is cut off: an open sheet gets no bubble; "
+        "null: nothing is"
+    )
     truth: str | None = doc("mesh of the true surface: the error of each vertex is measured, stored and colored")
     report: str | None = doc("json for the summary of the errors; null: the output's name with .json")
     colormap: str = doc("of errors. error: red = zero to blue = high, as the paper; perceptual: dark to light")
@@ -71,6 +75,10 @@ def reconstruct(cfg: Any) -> None:
     depth = reconstruction.octree_depth(points) if cfg.depth is None else cfg.depth
     with busy(f"Poisson reconstruction, depth {depth}", cfg.quiet):
         surface = reconstruction.reconstruct(points, normals, depth=depth, timeout=cfg.timeout, name=cfg.input)
+    if cfg.reach is not None:
+        before, surface = len(surface.mesh.vertices), reconstruction.cut_off(surface, points, cfg.reach)
+        if gone := before - len(surface.mesh.vertices):
+            say(f"cut:    {gone} of {before} vertices, far from all points (reach=null keeps them)")
     for text in surface.warnings():
         warn(text)
     if cfg.trim:
@@ -107,6 +115,8 @@ def _check_options(cfg: Any) -> None:
         raise ValueError(f"normals={cfg.normals}: expected auto or estimate")
     if cfg.colormap not in COLORMAPS:
         raise ValueError(f"colormap={cfg.colormap}: expected {' or '.join(COLORMAPS)}")
+    if cfg.reach is not None and not cfg.reach > 0:
+        raise ValueError(f"reach={cfg.reach:g}: expected a number of spacings above 0, such as 4, or null")
     if not 0 <= cfg.trim < 1:
         raise ValueError(f"trim={cfg.trim:g}: expected a share of the vertices from 0 to below 1, such as 0.05")
     if cfg.limit is not None and not cfg.limit > 0:

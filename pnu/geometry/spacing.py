@@ -13,3 +13,10 @@ def spacing(points: np.ndarray, neighbors: int = 6) -> float:
     points = points[:, :3]
     far = cKDTree(points).query(points[:: -(-len(points) // 4000)], k=[min(neighbors + 1, len(points))])[0]
     return float(np.median(far) * np.sqrt(np.pi / neighbors))
+
+
+def local_spacing(points: np.ndarray, neighbors: int = 6) -> np.ndarray:
+    """The same around each of the points `(n, >= 3)`: `(n,)`."""
+    k = min(neighbors, len(points) - 1)
+    far = cKDTree(points[:, :3]).query(points[:, :3], k=[k + 1])[0][:, 0]
+    return np.asarray(far * np.sqrt(np.pi / k))

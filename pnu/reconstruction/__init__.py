@@ -2,6 +2,7 @@
 
 from pnu.reconstruction.screened_poisson import (
     ReconstructedSurface,
+    cut_off,
     interpolated_values,
     octree_depth,
     reconstruct,
@@ -13,6 +14,7 @@ __all__ = [
     "ReconstructedSurface",
     "SurfaceErrors",
     "check_frame",
+    "cut_off",
     "interpolated_values",
     "octree_depth",
     "reconstruct",

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from pnu.geometry.mesh_sampling import closest_points, face_normals, signed_volume
 from pnu.geometry.mesh_topology import open_edges
 from pnu.geometry.normal_estimation import complete_normals
-from pnu.geometry.spacing import spacing
+from pnu.geometry.spacing import local_spacing, spacing
 from pnu.io import Cloud, Mesh, check_cloud
 from pnu.reconstruction import poisson_process
 from pnu.runtime.system_libraries import install_line, missing_packages
@@ -145,11 +145,31 @@ def trim(surface: ReconstructedSurface, quantile: float) -> ReconstructedSurface
     if not 0 <= quantile < 1:
         raise ValueError(f"trim={quantile:g}: expected a share of the vertices from 0 to below 1, such as 0.05")
     keep = surface.density >= np.quantile(surface.density, quantile)
+    return part_of(surface, keep, f"trim={quantile:g}", "a smaller one")
+
+
+def cut_off(surface: ReconstructedSurface, points: np.ndarray, reach: float) -> ReconstructedSurface:
+    """Without the vertices farther from all points (n, >= 3) than `reach` times the spacing around the nearest of them.
+
+    So an open sheet gets no bubble, and holes that are wider than twice that stay open.
+    """
+    if not reach > 0:
+        raise ValueError(f"reach={reach:g}: expected a number of spacings above 0, such as 4")
+    distance, nearest = cKDTree(points[:, :3]).query(surface.mesh.vertices)
+    around = local_spacing(points)
+    keep = distance <= reach * np.maximum(around, np.median(around))[nearest]
+    return part_of(surface, keep, f"reach={reach:g}", "a larger one")._replace(made_up=0.0)
+
+
+def part_of(surface: ReconstructedSurface, keep: NDArray[np.bool_], key: str, cure: str) -> ReconstructedSurface:
+    """The vertices to keep (v,), and the faces that use no others."""
+    if keep.all():
+        return surface
     faces = surface.mesh.faces[keep[surface.mesh.faces].all(1)]
     used = np.zeros(len(keep), bool)
     used[faces] = True
     if not used.any():
-        raise ValueError(f"trim={quantile:g}: leaves no face of {len(surface.mesh.faces)}; give a smaller one")
+        raise ValueError(f"{key}: leaves no face of {len(surface.mesh.faces)}; give {cure}")
     number = np.cumsum(used) - 1
     return surface._replace(mesh=Mesh(surface.mesh.vertices[used], number[faces]), density=surface.density[used])
 

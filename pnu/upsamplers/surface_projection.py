@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pnu.geometry.cloud_statistics import FAINT
 from pnu.geometry.even_spacing import repel, tangent_discs
 from pnu.geometry.local_frames import feet
 from pnu.geometry.neighbor_search import Search, knn, nearest
@@ -208,7 +209,7 @@ def is_clean_and_even(cloud: Tensor) -> bool:
     """Whether the points of a cloud (n, 6) are evenly spread, as farthest points are, and show no noise."""
     nearest_sq = knn(cloud[None, :, :3], cloud[None, :, :3], 2).dist_sq[0, :, 1]
     apart = nearest_sq.sqrt()
-    return bool(apart.std() < EVEN * apart.mean()) and noise_in_spacings(cloud) < SMOOTH
+    return bool(apart.std() < EVEN * apart.mean()) and noise_in_spacings(cloud) < FAINT
 
 
 def seeds_around(cloud: Tensor, each: int, count: int, step: Step = silent, *, first: int | None = None) -> Tensor:
