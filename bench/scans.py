@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from pnu.benchmark.cases import generator
 from pnu.data import shapes
 from pnu.data.mesh_scene import MeshScene
-from pnu.data.scanner import KINDS, Scan, Scanner
+from pnu.data.scanner import KINDS, Scanner, SimulatedScan
 from pnu.geometry.mesh_sampling import sample_poisson_disk
 from pnu.io import atomic_path, meshes_of, read_mesh, write_cloud
 from pnu.metrics.scan_scores import COLUMNS, LEGEND, scan_scores
@@ -27,15 +27,15 @@ from pnu.runtime.provenance import provenance
 from pnu.upsamplers.whole_clouds import upsample
 
 
-def pnu_default(scan: Scan) -> np.ndarray:
+def pnu_default(scan: SimulatedScan) -> np.ndarray:
     return upsample(scan.points, scan.normals)
 
 
-def pnu_as_it_is(scan: Scan) -> np.ndarray:
+def pnu_as_it_is(scan: SimulatedScan) -> np.ndarray:
     return upsample(scan.points, scan.normals, outliers="keep", lines="keep", density="even", keep=False)
 
 
-def open3d_chain(scan: Scan) -> np.ndarray:
+def open3d_chain(scan: SimulatedScan) -> np.ndarray:
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(scan.points))
     cloud, rows = cloud.remove_statistical_outlier(16, 2.0)
     if scan.normals is None:
@@ -50,12 +50,12 @@ def open3d_chain(scan: Scan) -> np.ndarray:
     return np.hstack([np.asarray(dense.points), np.asarray(dense.normals)])
 
 
-METHODS: dict[str, Callable[[Scan], np.ndarray]] = {
+METHODS: dict[str, Callable[[SimulatedScan], np.ndarray]] = {
     "pnu": pnu_default, "pnu, as it is": pnu_as_it_is, "open3d": open3d_chain,
 }  # fmt: skip
 
 
-def seen_points(scan: Scan, truth: np.ndarray, kind: str) -> np.ndarray:
+def seen_points(scan: SimulatedScan, truth: np.ndarray, kind: str) -> np.ndarray:
     """Those of the points of the true surface that lie where the scan has points."""
     there = scan.clean[np.isfinite(scan.clean[:, 0]), :3]
     tree = cKDTree(there)

@@ -37,8 +37,8 @@ def test_a_bowl_with_strays_becomes_a_clean_sheet(place: Path, capsys: pytest.Ca
     mesh, dense = read_mesh("mesh.ply"), read_cloud("dense.ply")
     assert len(dense.points) == 3 * 1530
     for points in (mesh.vertices, dense.points):
-        assert np.abs(np.linalg.norm(points, axis=1) - 1).max() < 0.1
-        assert points[:, 2].max() < 0.25  # no lid over the bowl
+        assert np.abs(np.linalg.norm(points, axis=1) - 1).max() < 0.2
+        assert points[:, 2].max() < 0.35  # no lid over the bowl
     assert mesh.vertices[:, 2].min() < -0.97
     removed = read_cloud("removed.ply", minimum=1)
     assert 20 < len(removed.points) < 40
@@ -73,9 +73,10 @@ def test_quiet_prints_nothing(place: Path, capsys: pytest.CaptureFixture[str]) -
 def test_a_surface_is_cut_off_where_its_points_end() -> None:
     points = bowl(2000)
     surface = reconstruction.reconstruct(points, points)
-    assert surface.mesh.vertices[:, 2].max() > 0.3  # the lid that Poisson reconstruction puts on
+    beyond = surface.mesh.vertices[:, 2].max()
+    assert beyond > 0.4  # Poisson reconstruction goes on past the rim
     cut = reconstruction.cut_off(surface, points, 4)
-    assert cut.mesh.vertices[:, 2].max() < 0.25
+    assert cut.mesh.vertices[:, 2].max() < 0.35
     assert cut.mesh.faces.max() == len(cut.mesh.vertices) - 1 == len(cut.density) - 1
     assert len(reconstruction.cut_off(surface, points, 1e9).mesh.faces) == len(surface.mesh.faces)
     with pytest.raises(ValueError, match="leaves no face of"):

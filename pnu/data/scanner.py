@@ -17,7 +17,7 @@ STEEPEST = 0.3  # cosine of incidence below which noise along the ray grows no f
 UP = np.array([0.0, 0.0, 1.0])
 
 
-class Scan(NamedTuple):
+class SimulatedScan(NamedTuple):
     """What a scan gives, and what is true of it; one row a point."""
 
     points: np.ndarray  # (n, 3) as measured
@@ -86,11 +86,11 @@ class Scanner:
         self.mesh = mesh
         self.scene: Any = None
 
-    def views(self, sensors: np.ndarray, camera: DepthCamera, rng: np.random.Generator) -> Scan:
+    def views(self, sensors: np.ndarray, camera: DepthCamera, rng: np.random.Generator) -> SimulatedScan:
         """What the same camera sees from sensors (v, 3), looking at the center."""
         return _together([self._view(sensor, camera, rng) for sensor in sensors])
 
-    def photogrammetry(self, of: Photogrammetry, rng: np.random.Generator) -> Scan:
+    def photogrammetry(self, of: Photogrammetry, rng: np.random.Generator) -> SimulatedScan:
         """Points matched in pictures taken from all sides."""
         many = sample_area(self.mesh, 10 * of.points, rng)
         x = many[:, :3]
@@ -113,18 +113,20 @@ class Scanner:
         ]
         lost = np.full((len(far), 6), np.nan)
         stray = np.repeat([False, True, True], [len(part) for part in points])
-        return Scan(np.vstack(points), None, np.vstack([clean, near, lost]), np.full((len(stray), 3), np.nan), stray)
+        return SimulatedScan(
+            np.vstack(points), None, np.vstack([clean, near, lost]), np.full((len(stray), 3), np.nan), stray
+        )
 
-    def turned_over(self, n: int, noise: float, share: float, rng: np.random.Generator) -> Scan:
+    def turned_over(self, n: int, noise: float, share: float, rng: np.random.Generator) -> SimulatedScan:
         """n even points with normals, noisy; the normals of a share of 40 patches look inward."""
         clean = sample_poisson_disk(self.mesh, n, rng)
         patches = clean[rng.choice(n, 40, replace=False), :3]
         patch = ((clean[:, None, :3] - patches) ** 2).sum(2).argmin(1)
         sign = np.where(np.isin(patch, rng.choice(40, round(40 * share), replace=False)), -1.0, 1.0)
         points = clean[:, :3] + noise * rng.standard_normal((n, 3))
-        return Scan(points, clean[:, 3:] * sign[:, None], clean, np.full((n, 3), np.nan), np.zeros(n, bool))
+        return SimulatedScan(points, clean[:, 3:] * sign[:, None], clean, np.full((n, 3), np.nan), np.zeros(n, bool))
 
-    def _view(self, sensor: np.ndarray, camera: DepthCamera, rng: np.random.Generator) -> Scan:
+    def _view(self, sensor: np.ndarray, camera: DepthCamera, rng: np.random.Generator) -> SimulatedScan:
         if self.scene is None:
             self.scene = ray_casting_scene([self.mesh], [np.zeros(3)])
         rays = _rays(sensor, camera)
@@ -145,45 +147,47 @@ class Scanner:
         measured, rays = np.concatenate([measured, between]), np.vstack([rays, rays[torn]])
         points = (sensor + measured[:, None] * rays) @ turn.T + shift
         stray = np.arange(len(points)) >= len(clean)
-        return Scan(points, None, np.vstack([clean, clean[torn]]), np.broadcast_to(sensor, points.shape), stray)
+        return SimulatedScan(
+            points, None, np.vstack([clean, clean[torn]]), np.broadcast_to(sensor, points.shape), stray
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "scene": None}  # a scene cannot be pickled
 
 
-def orbit(scanner: Scanner, rng: np.random.Generator) -> Scan:
+def orbit(scanner: Scanner, rng: np.random.Generator) -> SimulatedScan:
     """Structured light from ten sides, the views not quite aligned."""
     return scanner.views(3.0 * sphere_directions(10, rng), DepthCamera(turn=0.2, shift=0.002), rng)
 
 
-def oneview(scanner: Scanner, rng: np.random.Generator) -> Scan:
+def oneview(scanner: Scanner, rng: np.random.Generator) -> SimulatedScan:
     """One depth camera: one side only, depth in steps, points torn off at edges."""
     camera = DepthCamera(half=0.42, across=110, down=110, slant=0.1, step=0.004, torn=0.25)
     return scanner.views(2.6 * sphere_directions(7, rng)[rng.integers(7)][None], camera, rng)
 
 
-def lines(scanner: Scanner, rng: np.random.Generator) -> Scan:
+def lines(scanner: Scanner, rng: np.random.Generator) -> SimulatedScan:
     """A laser from four places, ten times as dense along a line as across lines."""
     camera = DepthCamera(half=0.38, across=260, down=26, noise=0.0015, slant=0.12)
     return scanner.views(2.8 * sphere_directions(4, rng), camera, rng)
 
 
-def photo(scanner: Scanner, rng: np.random.Generator) -> Scan:
+def photo(scanner: Scanner, rng: np.random.Generator) -> SimulatedScan:
     """Photogrammetry: uneven 30 to 1, lumpy, 3 % strays, four holes."""
     return scanner.photogrammetry(Photogrammetry(), rng)
 
 
-def flipped(scanner: Scanner, rng: np.random.Generator) -> Scan:
+def flipped(scanner: Scanner, rng: np.random.Generator) -> SimulatedScan:
     """5000 even points with normals, of which a quarter look inward, in patches."""
     return scanner.turned_over(5000, 0.004, 0.25, rng)
 
 
-KINDS: dict[str, Callable[[Scanner, np.random.Generator], Scan]] = {
+KINDS: dict[str, Callable[[Scanner, np.random.Generator], SimulatedScan]] = {
     "orbit": orbit, "oneview": oneview, "lines": lines, "photo": photo, "flipped": flipped,
 }  # fmt: skip
 
 
-def any_scan(scanner: Scanner, rng: np.random.Generator) -> Scan:
+def any_scan(scanner: Scanner, rng: np.random.Generator) -> SimulatedScan:
     """A scan to train on: any kind, resolution, noise and faults around those of `KINDS`."""
     kind = rng.choice(["views", "one", "lines", "photo"], p=[0.3, 0.2, 0.25, 0.25])
     noise = _log_uniform(rng, 0.0007, 0.006)
@@ -263,8 +267,8 @@ def _rotation(rng: np.random.Generator, degrees: float) -> np.ndarray:
     return rotation
 
 
-def _together(scans: Sequence[Scan]) -> Scan:
-    return Scan(
+def _together(scans: Sequence[SimulatedScan]) -> SimulatedScan:
+    return SimulatedScan(
         np.vstack([s.points for s in scans]), None,
         *(np.concatenate([getattr(s, name) for s in scans]) for name in ("clean", "sensor", "stray")),
     )  # fmt: skip

@@ -34,9 +34,9 @@ def write_scan_page(
     low, high = np.quantile(scan.points[kept], (0.001, 0.999), axis=0)
     center, radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
     drawings = [
-        Drawing("scan", scan.points[thinned(np.arange(len(scan.points)))]),
+        Drawing("scan", scan.points[every_kth(np.arange(len(scan.points)))]),
         *([Drawing("taken out", scan.points[stray])] if len(stray) >= FEWEST else []),
-        Drawing("dense cloud", dense[thinned(np.arange(len(dense)))]),
+        Drawing("dense cloud", dense[every_kth(np.arange(len(dense)))]),
         Drawing("surface", surface=mesh),
     ]
     counts = f"{len(scan.points)} points read, {len(dense)} made, {len(mesh.faces)} faces."
@@ -51,6 +51,6 @@ def write_scan_page(
     )
 
 
-def thinned(rows: np.ndarray) -> np.ndarray:
+def every_kth(rows: np.ndarray) -> np.ndarray:
     """Every k-th of the rows, at most `MOST`."""
     return rows[:: -(-len(rows) // MOST)]
