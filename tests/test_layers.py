@@ -5,7 +5,7 @@ import re
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -141,18 +141,53 @@ def test_a_public_name_is_defined_in_one_file(tmp_path: Path) -> None:
     assert "closing_lines" in defined_twice([*PACKAGE.rglob("*.py"), copy])
 
 
+# Methods whose meaning is a library's, beside its `on_...` and Python's `__...__`.
+HOOKS = {
+    *("forward", "update", "compute"),
+    *("setup", "prepare_data", "train_dataloader", "val_dataloader", "test_dataloader", "configure_optimizers"),
+    *("training_step", "validation_step", "test_step", "state_dict", "load_state_dict"),
+    *("save_checkpoint", "load_checkpoint", "apply", "revert"),
+}
+SECTIONS = ["Args", "Update", "Compute", "Returns", "Raises", "Source", "Example"]
+
+
+def documented(path: Path) -> Iterator[tuple[str, str | None]]:
+    """Public functions, classes and their methods but for hooks, with their docstrings."""
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+            yield node.name, ast.get_docstring(node)
+            for method in node.body if isinstance(node, ast.ClassDef) else []:
+                named = isinstance(method, ast.FunctionDef) and not method.name.startswith(("_", "on_"))
+                if named and not (method.name in HOOKS and ast.get_docstring(method) is None):
+                    yield f"{node.name}.{method.name}", ast.get_docstring(method)
+
+
 def undocumented(path: Path) -> list[str]:
-    """Public functions and classes of a file without a docstring."""
-    kinds = ast.FunctionDef | ast.ClassDef
-    found = (node for node in ast.parse(path.read_text()).body if isinstance(node, kinds))
-    return [node.name for node in found if not node.name.startswith("_") and ast.get_docstring(node) is None]
+    return [name for name, text in documented(path) if text is None]
 
 
 def test_every_public_definition_says_what_it_is(tmp_path: Path) -> None:
     assert {module: found for module, path in modules().items() if (found := undocumented(path))} == {}
     silent = tmp_path / "a.py"
-    silent.write_text("def f(): ...\n\n\ndef _g(): ...\n\n\nclass C:\n    'Said.'\n")
-    assert undocumented(silent) == ["f"]
+    silent.write_text("def f(): ...\n\n\ndef _g(): ...\n\n\nclass C:\n    'Said.'\n\n    def m(self): ...\n")
+    assert undocumented(silent) == ["f", "C.m"]
+
+
+def disordered(path: Path) -> list[str]:
+    """Definitions whose docstrings have their sections in another order, or two of one."""
+    wrong = []
+    for name, text in documented(path):
+        places = [SECTIONS.index(found) for found in re.findall(rf"^({'|'.join(SECTIONS)}):", text or "", re.M)]
+        if places != sorted(set(places)):
+            wrong.append(name)
+    return wrong
+
+
+def test_docstrings_have_one_order(tmp_path: Path) -> None:
+    assert {module: found for module, path in modules().items() if (found := disordered(path))} == {}
+    mixed = tmp_path / "a.py"
+    mixed.write_text('def f():\n    """Do.\n\n    Raises:\n        E: x\n\n    Args:\n        y: z\n    """\n')
+    assert disordered(mixed) == ["f"]
 
 
 def files_imported(path: Path, names: Collection[str]) -> set[str]:

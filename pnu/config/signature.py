@@ -47,6 +47,7 @@ class Class(NamedTuple):
 
     @property
     def target(self) -> str:
+        """Its dotted name, as `_target_` has it."""
         return f"{self.module.name}.{self.node.name}"
 
 

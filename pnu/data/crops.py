@@ -80,6 +80,10 @@ class Crops(Dataset[dict[str, Any]]):
     def crop(
         self, clean: np.ndarray, noisy: np.ndarray, rng: np.random.Generator, rough: np.ndarray | None = None
     ) -> dict[str, Any]:
+        """Input and target (size, 6) around a random point, with the normals of a random side.
+
+        Those of the input are given or estimated, in the crop alone or as `rough` (n, 3) in the whole cloud.
+        """
         center = noisy[rng.integers(len(noisy)), :3]
         size = min(self.size + (MARGIN if self.estimated and rough is None else 0), len(noisy))
         distance = np.linalg.norm(noisy[:, :3] - center, axis=1)

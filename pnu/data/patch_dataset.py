@@ -96,6 +96,7 @@ class PatchDataset(Dataset[dict[str, Any]]):
         return sample | {"index": row, "shape": self.names[row] if self.names else f"patch_{row}"}
 
     def downsampled(self, target: Tensor, row: int, generator: torch.Generator) -> Tensor:
+        """The input (1, input_points, 3 or 6) of a target (1, n, 6), drawn from it or, if given, from the file's."""
         m, kind = self.options.input_points, self.options.downsampling
         if kind == "given":
             given = self.read("montecarlo_1024", row)
@@ -143,10 +144,12 @@ class EpochSampler(Sampler[tuple[int, int]]):
         return self.batches * self.batch_size
 
     def set_epoch(self, epoch: int) -> None:
+        """Go on with another epoch, from its begin."""
         if epoch != self.epoch:
             self.epoch, self.start = epoch, 0
 
     def start_at(self, epoch: int, batch: int) -> None:
+        """Begin the next pass at a batch of an epoch."""
         self.epoch, self.start = epoch, batch * self.batch_size
 
     def __iter__(self) -> Iterator[tuple[int, int]]:

@@ -78,6 +78,7 @@ class EpochDataModule(pl.LightningDataModule):
         return self.evaluation_loader("test")
 
     def evaluation_loader(self, part: str) -> DataLoader[Any]:
+        """This process's share of the validation or the test, in order."""
         rank, world = self.process
         data = self.datasets[part]
         number: int = len(data)  # type: ignore[arg-type]
@@ -86,6 +87,7 @@ class EpochDataModule(pl.LightningDataModule):
         return self.loader(data, self.evaluation_batch_size, collate_fn=self.collate_evaluation)
 
     def loader(self, data: Dataset[Any], batch_size: int, **options: Any) -> DataLoader[Any]:
+        """Batches of a dataset, by as many processes as `workers`."""
         # spawned workers: a fork of a process with threads may hang
         context = "spawn" if self.workers else None
         return DataLoader(
@@ -218,6 +220,7 @@ class GeneratedDataModule(PatchDataModule):
         raise NotImplementedError
 
     def patch_file(self) -> Path:
+        """The file of patches; its name says what they depend on, so that others are cut anew."""
         parameters = self.parameters() | {"patches": self.patches, "seed": self.shape_seed, "schema": 1}
         digest = hashlib.sha256(json.dumps(parameters, sort_keys=True).encode()).hexdigest()[:12]
         path = self.cache / f"{parameters['source']}_{self.patches}_{digest}.h5"
@@ -260,9 +263,11 @@ class SyntheticDataModule(GeneratedDataModule):
         self.kinds = list(kinds)
 
     def makers(self) -> dict[str, Callable[[], Mesh]]:
+        """Functions that make the procedural shapes, by name."""
         return {name: functools.partial(shapes.make, name) for name in shapes.names(*self.kinds)}
 
     def parameters(self) -> dict[str, Any]:
+        """The shapes' names, and their version."""
         return {"source": "synthetic", "shapes": shapes.names(*self.kinds), "version": shapes.VERSION}
 
 
@@ -280,6 +285,7 @@ class MeshDataModule(GeneratedDataModule):
 
     @functools.cached_property
     def files(self) -> dict[str, Path]:
+        """The files of the folder, by the names of their shapes."""
         if self.root is None:
             raise ValueError(
                 "data.root=FOLDER is required: a folder of meshes (ply, off, obj, stl, glb, gltf, vtk, vtp)"
@@ -287,8 +293,10 @@ class MeshDataModule(GeneratedDataModule):
         return meshes_of(self.root)
 
     def makers(self) -> dict[str, Callable[[], Mesh]]:
+        """Functions that read the meshes, by name."""
         return {name: functools.partial(read_mesh, path) for name, path in self.files.items()}
 
     def parameters(self) -> dict[str, Any]:
+        """The digests of the files."""
         hashes = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in self.files.items()}
         return {"source": "meshes", "shapes": hashes}

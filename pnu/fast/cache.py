@@ -24,10 +24,12 @@ class Chunk(NamedTuple):
 
     @property
     def rows(self) -> slice:
+        """Its rows, as an index."""
         return slice(self.start, self.stop)
 
     @property
     def groups(self) -> slice:
+        """Its groups, as an index."""
         return slice(self.first, self.last)
 
     def grouped(self, rows: Tensor) -> Tensor:

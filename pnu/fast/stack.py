@@ -107,9 +107,11 @@ class Rows(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, int]:
+        """(R, C)."""
         return self.table.shape[0], self.table.shape[1]
 
     def chunk(self, chunk: Chunk, space: Tensor) -> Tensor:
+        """Rows of a chunk, a view; `space` stays unused."""
         return self.table[chunk.rows]
 
 
@@ -122,6 +124,7 @@ class Differences(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, int]:
+        """(R, C)."""
         return len(self.groups.source), self.table.shape[1]
 
     def chunk(self, chunk: Chunk, space: Tensor) -> Tensor:

@@ -20,6 +20,7 @@ class CompoundLoss(compound.CompoundLoss):
     """`losses.CompoundLoss`, its neighborhood terms in one pass."""
 
     def neighborhood_terms(self, prediction: Tensor, neighbors: Tensor) -> dict[str, Tensor]:
+        """As the plain loss has them; prediction (B, m, 6), neighbors (B, m, k)."""
         if prediction.shape[-1] != 6 or prediction.device.type != "cpu":
             return super().neighborhood_terms(prediction, neighbors)
         count = neighbors.numel() if self.reduction == "mean" else len(neighbors)

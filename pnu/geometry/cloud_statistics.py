@@ -32,6 +32,7 @@ class CloudStatistics(NamedTuple):
 
     @property
     def uneven(self) -> bool:
+        """Whether the density differs from place to place."""
         return self.sparse > UNEVEN * self.dense
 
     def __str__(self) -> str:

@@ -38,6 +38,7 @@ class Decline(NamedTuple):
     most: int  # points there are
 
     def at(self, number: NDArray[np.int64]) -> NDArray[np.float64]:
+        """The distance (k,) when so many points (k,) were chosen, interpolated."""
         return np.interp(number, self.number, self.distance)
 
     def before(self, distance: float) -> float:

@@ -38,6 +38,7 @@ class NeighborCloud(NamedTuple):
 
     @staticmethod
     def of(points: Tensor) -> NeighborCloud:
+        """Of points (n, 3) in any unit."""
         points = points.detach().double()
         points = points - points.mean(0)
         points = (points / points.norm(dim=1).max().clamp_min(1e-30)).float()

@@ -16,6 +16,7 @@ class Shifted(NamedTuple):
 
     @property
     def notes(self) -> tuple[str, ...]:
+        """The line on a shift; none where there was none."""
         return (f"coordinates are in single precision, less a shift that the file names: {self.text}",) * bool(
             self.text
         )

@@ -37,10 +37,17 @@ def load(source: str | PathLike[str], allow: Sequence[str] = ()) -> nn.Module:
     influence.
 
     Args:
+        source: run folder, file of weights, name of shipped weights, or "newest".
         allow: packages of your own whose networks may be built too; they run their code. A run's own config has no say.
 
     Raises:
         ValueError: no run folder, or its config or checkpoint are not those of a network of ours.
+
+    Example:
+        >>> import pnu
+        >>> network = pnu.load("surface")
+        >>> network.ratio, network.training
+        (4, False)
     """
     source = resolve(source)
     if (file := weights.find(source)) is not None:

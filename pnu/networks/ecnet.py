@@ -36,6 +36,7 @@ class ECNet(nn.Module):
         return self.outputs(patch)["prediction"]
 
     def outputs(self, patch: Tensor) -> dict[str, Tensor]:
+        """ "prediction" (B, ratio n, 3), and "edge_distance" (B, ratio n) of each of its points to the nearest edge."""
         points = coordinates(patch)
         features = self.expansion(self.features(points))
         return {

@@ -68,6 +68,7 @@ class PUGeo(nn.Module):
         return self.outputs(patch)["prediction"]
 
     def outputs(self, patch: Tensor) -> dict[str, Tensor]:
+        """ "prediction" (B, ratio n, 6), and "coarse_normal" (B, n, 3) of each input point, not of unit length."""
         points = coordinates(patch)
         features = self.recalibrated(points)
         batch, n, _ = points.shape

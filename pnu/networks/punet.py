@@ -82,6 +82,7 @@ class PUNet(nn.Module):
         return dense
 
     def outputs(self, patch: Tensor) -> dict[str, Tensor]:
+        """What the loss may read: here the prediction alone."""
         return {"prediction": self(patch)}
 
 

@@ -33,10 +33,12 @@ class DepthBuffer:
         self.low, self.steps = low, 2**24 / ((high - low) or 1.0)
 
     def add(self, pixel: Index, depth: Array, primitive: Index) -> None:
+        """Primitives (k,) at pixels (k,), in depths (k,)."""
         steps = ((depth - self.low) * self.steps).astype(np.int64)
         np.maximum.at(self.key, pixel, (steps << 32) | primitive)
 
     def fragments(self) -> Fragments:
+        """The pixels that show anything, and what."""
         pixel = np.flatnonzero(self.key >= 0)
         return Fragments(pixel, self.key[pixel] & 0xFFFFFFFF)
 

@@ -30,6 +30,7 @@ class ShownCase(NamedTuple):
 
     @classmethod
     def of(cls, case: Case) -> "ShownCase":
+        """A case before any method: the input alone."""
         return cls(case, {"input": np.hstack([case.points, normals_of(case)]).astype(np.float32)})
 
 

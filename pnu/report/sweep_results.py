@@ -31,6 +31,7 @@ class Run(NamedTuple):
 
     @property
     def seed(self) -> Any:
+        """Of its config."""
         return self.config.get("seed")
 
 
@@ -56,6 +57,7 @@ class Setting(NamedTuple):
     runs: Sequence[Run]
 
     def of(self, metric: str) -> list[float]:
+        """A metric's values, one for each run that has it."""
         return [run.metrics[metric] for run in self.runs if metric in run.metrics]
 
     def mean(self, metric: str) -> float:
@@ -77,6 +79,7 @@ class Study(NamedTuple):
 
     @property
     def baseline(self) -> Setting | None:
+        """The setting that others are compared with; None in a search."""
         return None if self.search else self.settings[0]
 
     @property

@@ -52,6 +52,7 @@ class Packer:
         return place
 
     def text(self) -> str:
+        """All arrays, compressed, as base64."""
         return base64.b64encode(gzip.compress(b"".join(self.parts), 6, mtime=0)).decode()
 
 

@@ -45,6 +45,7 @@ class InProcess:
         self.begun: tuple[Begin, Tensor] | None = None
 
     def map(self, begin: Begin, cloud: Tensor, parts: Sequence[Tensor]) -> Iterator[Tensor]:
+        """See `Workers`."""
         if self.begun is None or self.begun[0] is not begin or self.begun[1] is not cloud:
             self.begun, self.work = (begin, cloud), begin(self.network, cloud)
         return map(self.work, parts)
@@ -81,6 +82,7 @@ class Processes:
         self.folder.cleanup()
 
     def map(self, begin: Begin, cloud: Tensor, parts: Sequence[Tensor]) -> Iterator[Tensor]:
+        """See `Workers`; ValueError where a process ended amid its work."""
         if cloud is not self.cloud:
             self.cloud, self.path = cloud, Path(self.folder.name) / f"{next(self.number)}.npy"
             np.save(self.path, cloud.cpu().numpy())

@@ -97,6 +97,7 @@ class Checkpoints(pl.Callback):
             self.save_last(trainer)
 
     def save_last(self, trainer: pl.Trainer) -> None:
+        """Write last.ckpt, after the curves up to it."""
         for logger in trainer.loggers:
             logger.save()  # what is logged reaches the disk no later than the checkpoint
         trainer.save_checkpoint(self.run.last)
@@ -302,6 +303,7 @@ class Pictures(pl.Callback):
             self.draw(trainer, module)
 
     def draw(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        """Put the clouds as they are now into TensorBoard and the run folder; inputs and targets the first time."""
         if not trainer.is_global_zero:
             return
         first, self.drawn = self.drawn < 0, trainer.global_step

@@ -229,6 +229,7 @@ class UpsamplingModule(pl.LightningModule):
         self.log_metrics("test", self.test_metrics)
 
     def log_metrics(self, stage: str, metrics: CloudMetrics) -> None:
+        """Log the metrics of all processes under val/ or test/, and start them anew."""
         # compute() has added up all processes; sync_dist then means over equal values
         self.log_dict({f"{stage}/{name}": value for name, value in metrics.compute().items()}, sync_dist=True)
         metrics.reset()

@@ -103,7 +103,7 @@ def main() -> None:
     """The command line."""
     from safetensors.torch import save
 
-    parser = argparse.ArgumentParser(prog="python -m pnu.training.outlier_training", description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("meshes", type=Path, help="folder of closed meshes, beside the procedural shapes")
     parser.add_argument("output", type=Path, help="file of weights to write")
     parser.add_argument("--leave", nargs="*", default=[], help="names of meshes that are not trained on")

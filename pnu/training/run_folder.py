@@ -96,12 +96,14 @@ class RunFolder:
         return folder
 
     def write_config(self, config: Mapping[str, Any]) -> None:
+        """Write config.yaml."""
         from omegaconf import OmegaConf
 
         with atomic_path(self.config) as temporary:
             temporary.write_text(OmegaConf.to_yaml(OmegaConf.create(dict(config))), encoding="utf-8")
 
     def read_record(self) -> dict[str, Any]:
+        """What run.json says; nothing where it is not there yet."""
         return read_json(self.record_path) if self.record_path.exists() else {}
 
     def add_metrics(self, section: str, results: Sequence[Mapping[str, float]]) -> None:
@@ -160,6 +162,7 @@ class RunFolder:
             self.unlock()
 
     def unlock(self) -> None:
+        """Give the lock of a sweep's job back, if there is one."""
         if self.lock is not None:
             os.close(self.lock)
             self.lock = None

@@ -208,6 +208,7 @@ class WithoutEcho:
         self.stream = stream
 
     def write(self, text: str) -> int:
+        """Pass the text on, but for Hydra's lines; its length."""
         return len(text) if text.startswith(self.ECHO) else self.stream.write(text)
 
     def __getattr__(self, name: str) -> Any:

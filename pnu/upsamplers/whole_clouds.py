@@ -57,7 +57,8 @@ def upsample(
     """A denser cloud on the same surface.
 
     Networks of patches are used as in the paper (`pnu.upsamplers.patches`); "surface" and upsamplers without a network
-    take the cloud as a whole. Neither the order of the points nor repeated ones have an influence.
+    take the cloud as a whole. Neither the order of the points nor repeated ones have an influence. A network comes back
+    as it was, modes and device too; generators and settings of torch are left alone.
 
     Args:
         points: (n, 3), or (n, 6) with normals, n >= 16, in any unit and anywhere; an array, or a tensor on any device.
@@ -92,7 +93,16 @@ def upsample(
     Raises:
         ValueError: in one line, which argument is wrong and what was expected.
 
-    The network comes back as it was, modes and device too; generators and settings of torch are left alone.
+    Example:
+        >>> import numpy as np
+        >>> import pnu
+        >>> sphere = np.random.default_rng(0).normal(size=(500, 3))
+        >>> sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
+        >>> dense = pnu.upsample(sphere, ratio=4)
+        >>> dense.shape
+        (2000, 6)
+        >>> bool((abs(np.linalg.norm(dense[:, :3], axis=1) - 1) < 0.05).all())
+        True
     """
     given = _given(points, normals)
     count = output_count(len(given.points), ratio if spacing is None else ratio_of_spacing(given.points, spacing))
@@ -202,6 +212,17 @@ def normals(points: np.ndarray, neighbors: int = 16, *, progress: Progress = sil
 
     Raises:
         ValueError: in one line, which argument is wrong and what was expected.
+
+    Example:
+        >>> import numpy as np
+        >>> import pnu
+        >>> sphere = np.random.default_rng(0).normal(size=(500, 3))
+        >>> sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
+        >>> normals = pnu.normals(sphere)
+        >>> normals.shape
+        (500, 3)
+        >>> bool(((normals * sphere).sum(axis=1) > 0.9).all())
+        True
     """
     array = _array(points, "points: expected an array (n, 3)")
     if array.ndim != 2 or array.shape[1] != 3:
