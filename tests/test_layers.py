@@ -190,6 +190,45 @@ def test_docstrings_have_one_order(tmp_path: Path) -> None:
     assert disordered(mixed) == ["f"]
 
 
+def names_in(path: Path) -> set[str]:
+    """What a file defines: functions, classes, their methods, constants; keys of yaml."""
+    text = path.read_text()
+    if path.suffix == ".yaml":
+        return set(re.findall(r"^ *(\w+):", text, re.M))
+    names = set()
+    for node in ast.parse(text).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add(node.name)
+        if isinstance(node, ast.ClassDef):
+            names |= {f"{node.name}.{part.name}" for part in node.body if isinstance(part, ast.FunctionDef)}
+        if isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names |= {target.id for target in targets if isinstance(target, ast.Name)}
+    return names
+
+
+def lost(table: str) -> list[str]:
+    """Of a table's answers: files that are not there, and names that the file before them does not define."""
+    missing = []
+    for row in re.findall(r"^\| [A-Z].*?\| (.*) \|$", table, re.M):
+        path = Path()
+        for told in re.findall(r"`([^` ]+)`", row):
+            if "/" in told:
+                path = PACKAGE.parent / told
+                missing += [told] * (not path.is_file())
+            elif not path.is_file() or told not in names_in(path):
+                missing.append(told)
+    return missing
+
+
+def test_the_answers_to_where_is_are_right() -> None:
+    page = (PACKAGE.parent / "CONTRIBUTING.md").read_text()
+    table = page.split("## Where is ...?")[1].split("\n## ")[0]
+    assert table.count("? | ") == 10
+    assert lost(table) == []
+    assert lost("| Where? | `pnu/io/e57.py` `read_e75`, `pnu/io/e75.py` |") == ["read_e75", "pnu/io/e75.py"]
+
+
 def files_imported(path: Path, names: Collection[str]) -> set[str]:
     """The files behind the imports of a file, those for type checkers too."""
     found = set()

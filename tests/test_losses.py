@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pnu.fast import accelerate, terms
 from pnu.geometry.assignment import assign
-from pnu.geometry.grouping import gather
+from pnu.geometry.neighbor_features import gather
 from pnu.losses import compound as losses
 from pnu.losses.compound import CompoundLoss, Matches, search
 

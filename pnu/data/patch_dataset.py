@@ -13,7 +13,7 @@ from torch.utils.data import Dataset, Sampler
 
 from pnu.data.augment import Augmentation
 from pnu.data.patch_file import check_patch_file
-from pnu.geometry.grouping import gather
+from pnu.geometry.neighbor_features import gather
 from pnu.geometry.sampling import nonuniform_points, poisson_disk_points, random_points
 from pnu.geometry.unit_sphere import unit_sphere_frame
 

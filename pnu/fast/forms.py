@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from pnu.fast import stack
 from pnu.fast.combine import combine
 from pnu.fast.neighborhoods import Neighborhoods, distinct, pool, single, whole
-from pnu.geometry.grouping import gather
+from pnu.geometry.neighbor_features import gather
 from pnu.geometry.neighbor_search import ball_query, knn
 from pnu.networks import layers, pugeo
 

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pnu.geometry.assignment import assign
-from pnu.geometry.grouping import gather
+from pnu.geometry.neighbor_features import gather
 from pnu.geometry.neighbor_search import knn, nearest
 
 Reduction = Literal["mean", "sum"]

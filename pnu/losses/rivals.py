@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from pnu.geometry.grouping import gather
+from pnu.geometry.neighbor_features import gather
 from pnu.geometry.neighbor_search import knn, nearest
 from pnu.losses.compound import chamfer, emd, search
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from pnu.geometry.grouping import gather, interpolate
+from pnu.geometry.neighbor_features import gather, interpolate
 from pnu.geometry.neighbor_search import ball_query
 from pnu.networks.norm import BatchNorm
 

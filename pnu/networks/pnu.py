@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pnu.geometry.grouping import gather
+from pnu.geometry.neighbor_features import gather
 from pnu.geometry.sampling import farthest_points
 from pnu.networks.layers import MLP, Abstraction, JoinedMLP, PooledMLP, Propagation, expand
 

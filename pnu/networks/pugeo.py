@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from pnu.geometry.grouping import gather
+from pnu.geometry.neighbor_features import gather
 from pnu.geometry.neighbor_search import knn
 from pnu.networks.layers import MLP
 from pnu.networks.norm import BatchNorm

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from pnu.geometry.grouping import gather, interpolate
+from pnu.geometry.neighbor_features import gather, interpolate
 from pnu.geometry.sampling import farthest_points
 from pnu.networks.layers import MLP, Abstraction
 

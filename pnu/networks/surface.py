@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from torch.nn.functional import linear, normalize
 
 from pnu.geometry.even_spacing import tangent_discs
-from pnu.geometry.grouping import gather
 from pnu.geometry.local_frames import FEATURES, local_frames
+from pnu.geometry.neighbor_features import gather
 from pnu.geometry.neighbor_search import knn
 from pnu.geometry.sampling import farthest_points
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pnu.geometry.grouping import gather, interpolate
+from pnu.geometry.neighbor_features import gather, interpolate
 from tests import reference
 
 

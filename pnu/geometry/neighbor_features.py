@@ -1,4 +1,4 @@
-"""Collect features at neighbors."""
+"""Features at neighbors: gathered, or interpolated between the nearest three."""
 
 import torch
 from torch import Tensor
