@@ -27,6 +27,7 @@ from pnu.io import read_cloud, write_cloud, write_json, write_mesh
 from pnu.runtime.system_libraries import open3d_error
 from pnu.training import sweeps
 from pnu.training.run_folder import RunFolder
+from tests.conftest import REPOSITORY
 from tests.test_docs import released_checkpoint
 from tests.test_train import patch_file  # noqa: F401  a fixture
 
@@ -121,6 +122,7 @@ PLACES = {
     "training/run_folder.py line": "test_from_patches_to_a_picture",
     "commands/upsample.py upsample": "test_from_patches_to_a_picture",
     "commands/reconstruct.py reconstruct": "test_from_patches_to_a_picture",
+    "commands/scan.py scan": "test_a_scan_then_a_picture",
     "commands/export.py export": "test_weights_kept_as_a_file",
     "commands/convert.py convert": "test_weights_of_the_released_code",
     "commands/evaluate.py evaluate": "test_an_evaluation_then_a_comparison",
@@ -156,9 +158,7 @@ def test_every_place_that_makes_a_line_is_run() -> None:
     found = {f"{path.relative_to(PACKAGE)} {name}" for path in paths for name in callers(path)}
     found = {place.replace("_entry.py command", "_entry.py main") for place in found}
     assert found == set(PLACES)
-    tests = "".join(
-        (Path(__file__).parent / name).read_text() for name in ("test_quoting.py", "test_sweep.py", "test_train.py")
-    )
+    tests = "".join(path.read_text(encoding="utf-8") for path in REPOSITORY.glob("tests/**/test_*.py"))
     for test in PLACES.values():
         assert f"def {test}(" in tests
 
@@ -221,6 +221,14 @@ def test_from_patches_to_a_picture(say: Say, trained: str) -> None:
         pytest.skip("open3d's system libraries are missing")
     mesh = say(printed(dense), override("output", in_nasty("mesh.ply")), "depth=4")
     say(printed(mesh), "size=64")
+    assert Path("picture.png").stat().st_size > 0
+
+
+def test_a_scan_then_a_picture(say: Say) -> None:
+    if open3d_error():
+        pytest.skip("open3d's system libraries are missing")
+    made = say(shell_line("scan", input="cloud.ply", output=in_nasty("mesh.ply")), "ratio=1", "depth=4")
+    say(printed(made), "size=64")
     assert Path("picture.png").stat().st_size > 0
 
 
