@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
-from pnu.geometry.cloud_statistics import describe_cloud
+from pnu.data import shapes
+from pnu.geometry.cloud_statistics import CONTRADICTING, describe_cloud
+from pnu.geometry.flipped_parts import flipped_share, smaller_sides
+from pnu.geometry.mesh_sampling import sample_area
 
 RNG = np.random.default_rng(0)
 
@@ -77,6 +80,56 @@ def test_normals_that_contradict_each_other() -> None:
             assert found.contradicting == pytest.approx(2 * flipped * (1 - flipped), abs=0.04)
             (line,) = found.warnings()
             assert f"{found.contradicting:.0%} of neighboring normals contradict each other; normals=estimate" in line
+
+
+def lens(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Two caps of a sphere that meet in an edge as sharp as a knife's, 23 degrees."""
+    points = sphere(400 * n)
+    caps = points[np.abs(points[:, 2]) > 0.98][:n]
+    return caps - 0.98 * np.sign(caps[:, 2:]) * [0, 0, 1], caps
+
+
+@pytest.mark.parametrize("count", [1000, 5000, 60_000])
+def test_a_flipped_half_is_told_though_few_pairs_contradict_each_other(count: int) -> None:
+    points = sphere(count)
+    half = describe_cloud(1e4 + 1e-3 * points, points * np.where(points[:, 2:] > 0, 1, -1))
+    assert half.flipped == pytest.approx(0.5, abs=0.06)
+    assert half.contradicting < CONTRADICTING or count < 5000  # these alone told nothing
+    (line,) = half.warnings()
+    assert line.startswith(f"at least {half.flipped:.0%} of the normals look to the other side than those beside them")
+    noisy = points + 0.01 * RNG.normal(size=points.shape)
+    cap = np.where(points[:, 2:] > 0.5, 1, -1) * np.where(RNG.random((count, 1)) < 0.2, np.nan, points)
+    assert flipped_share(noisy, cap) == pytest.approx(0.25, abs=0.06)
+    two = np.vstack([points, points + [9, 0, 0]])  # two things side by side may look as they like
+    assert flipped_share(two, np.vstack([points, -points])) == 0
+
+
+@pytest.mark.parametrize("name", ["teapot", "mug", "gear", "person", "wrench"])
+def test_a_flipped_half_of_other_shapes(name: str) -> None:
+    cloud = sample_area(shapes.make(name), 5000, np.random.default_rng(0))
+    points, normals = cloud[:, :3], cloud[:, 3:]
+    assert flipped_share(points, normals) == 0
+    upper = points[:, 1:2] > np.median(points[:, 1])
+    assert flipped_share(points, np.where(upper, -1, 1) * normals) > 0.05
+
+
+@pytest.mark.parametrize("noise", [0, 0.003, 0.01, 0.03])
+@pytest.mark.parametrize("count", [500, 5000])
+def test_thin_and_sharp_things_are_not_taken_for_flipped(count: int, noise: float) -> None:
+    for points, normals in (cube(count), plate(count, 0.01), plate(count, 0.1), lens(count)):
+        assert flipped_share(points + noise * RNG.normal(size=points.shape), normals) == 0
+    for name in ("spring_clip", "cup", "heat_sink", "moebius", "perforated_plate"):
+        cloud = sample_area(shapes.make(name), count, RNG)
+        assert flipped_share(cloud[:, :3] + noise * RNG.normal(size=(count, 3)), cloud[:, 3:]) == 0
+    points = sphere(count)
+    assert flipped_share(points, sphere(count)) == 0  # no normals at all, and signs at random
+    assert flipped_share(points, points * RNG.choice([-1, 1], (count, 1))) == 0
+
+
+def test_the_smaller_side_of_each_group_of_parts() -> None:
+    sizes = np.array([50, 30, 40, 7, 9, 100])  # 0 | 1 | 2 in a row: 30 against 90; 3 | 4; 5 alone
+    assert smaller_sides(sizes, np.array([[0, 1], [2, 1], [3, 4]])) == 30 + 7
+    assert smaller_sides(sizes, np.empty((0, 2), int)) == 0
 
 
 def test_a_point_far_from_all_others_is_named() -> None:

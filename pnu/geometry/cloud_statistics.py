@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from pnu.geometry.flipped_parts import flipped_share
 from pnu.geometry.noise_level import noise_level
 
 NEIGHBORS = 8
@@ -27,6 +28,7 @@ class CloudStatistics(NamedTuple):
     noise: float  # standard deviation across the surface, an upper bound
     radius: float  # largest distance from the middle of the box
     contradicting: float  # share of neighboring pairs whose normals look against each other
+    flipped: float  # share of the points in whole parts whose normals look to the other side than those beside them
     far: int  # points that lie farther from all others than those are from each other
     farthest: int  # row of the one that lies farthest
 
@@ -44,7 +46,12 @@ class CloudStatistics(NamedTuple):
     def warnings(self) -> list[str]:
         """What is wrong with the cloud, a line each; nothing as a rule."""
         found = []
-        if self.contradicting > CONTRADICTING:
+        if self.flipped:
+            found.append(
+                f"at least {self.flipped:.0%} of the normals look to the other side than those beside them, in whole "
+                "parts; normals=estimate makes others"
+            )
+        elif self.contradicting > CONTRADICTING:
             found.append(
                 f"{self.contradicting:.0%} of neighboring normals contradict each other; normals=estimate makes others"
             )
@@ -65,8 +72,8 @@ def describe_cloud(points: np.ndarray, normals: np.ndarray | None = None) -> Clo
     noise = noise_level(torch.from_numpy(points), None if units is None else torch.from_numpy(units))
     center = (points.min(0) + points.max(0)) / 2
     radius = float(np.linalg.norm(points - center, axis=1).max())
-    against = 0.0 if units is None else contradicting(points, units)
-    return CloudStatistics(dense, middle, sparse, noise, radius, against, *far_points(points))
+    against, flipped = (0.0, 0.0) if units is None else (contradicting(points, units), flipped_share(points, units))
+    return CloudStatistics(dense, middle, sparse, noise, radius, against, flipped, *far_points(points))
 
 
 def contradicting(points: np.ndarray, normals: np.ndarray) -> float:
