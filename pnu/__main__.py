@@ -10,6 +10,32 @@ from pathlib import Path
 from pnu import __version__
 
 COMMANDS = Path(__file__).parent / "commands"
+BASH = """\
+_pnu() {{
+  local keys
+  case ${{COMP_WORDS[1]}} in
+{cases}
+  esac
+  [ "$COMP_CWORD" -gt 1 ] || keys='{verbs}'
+  COMPREPLY=($(compgen -W "$keys" -- "${{COMP_WORDS[COMP_CWORD]}}"))
+}}
+complete -o nospace -o default -F _pnu pnu"""
+ZSH = """\
+whence compdef > /dev/null || {{ autoload -U compinit && compinit }}
+_pnu() {{
+  local keys
+  case $words[2] in
+{cases}
+  esac
+  if (( CURRENT == 2 )); then
+    compadd -- {verbs}
+  elif compset -P '*='; then
+    _files
+  else
+    compadd -S '' -- ${{=keys}}
+  fi
+}}
+compdef _pnu pnu"""
 
 
 def verbs() -> dict[str, str]:
@@ -50,21 +76,8 @@ def completion(shell: str) -> str:
         config = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
         groups = [key for entry in config.pop("defaults", []) if isinstance(entry, dict) for key in entry]
         keys = sorted({*config, *groups} - {"hydra"})
-        cases.append(f"    {verb}) words='--help {' '.join(f'{key}=' for key in keys)}' ;;")
-    known = " ".join(verbs())
-    lines = ["autoload -U +X bashcompinit && bashcompinit"] if shell == "zsh" else []
-    lines += [
-        "_pnu() {",
-        "  local words",
-        "  case ${COMP_WORDS[1]} in",
-        *cases,
-        "  esac",
-        f"  [ \"$COMP_CWORD\" -gt 1 ] || words='{known}'",
-        '  COMPREPLY=($(compgen -W "$words" -- "${COMP_WORDS[COMP_CWORD]}"))',
-        "}",
-        "complete -o nospace -o default -F _pnu pnu",
-    ]
-    return "\n".join(lines)
+        cases.append(f"    {verb}) keys='--help {' '.join(f'{key}=' for key in keys)}' ;;")
+    return {"bash": BASH, "zsh": ZSH}[shell].format(verbs=" ".join(verbs()), cases="\n".join(cases))
 
 
 def main(argv: Sequence[str] | None = None) -> None:

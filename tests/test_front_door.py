@@ -1,5 +1,6 @@
 """`pnu VERB`: verbs, mistakes, and what shells complete."""
 
+import shutil
 import subprocess
 import sys
 
@@ -35,15 +36,15 @@ def test_the_module_that_trains_and_the_verb_are_one() -> None:
     assert by_module.stdout.splitlines()[1:] == by_verb.stdout.splitlines()[1:]
 
 
-@pytest.mark.parametrize(
-    ("typed", "expected"),
-    [
-        ("up", ["upsample"]),
-        ("re", ["reconstruct", "report"]),
-        ("upsample rat", ["ratio="]),
-        ("train sched", ["scheduler="]),
-    ],
-)
+COMPLETED = [
+    ("up", ["upsample"]),
+    ("re", ["reconstruct", "report"]),
+    ("upsample rat", ["ratio="]),
+    ("train sched", ["scheduler="]),
+]
+
+
+@pytest.mark.parametrize(("typed", "expected"), COMPLETED)
 def test_a_shell_completes_verbs_and_keys(typed: str, expected: list[str]) -> None:
     words = ["pnu", *typed.split()]
     script = f"{completion('bash')}\nCOMP_WORDS=({' '.join(words)}); COMP_CWORD={len(words) - 1}; _pnu\n"
@@ -51,3 +52,21 @@ def test_a_shell_completes_verbs_and_keys(typed: str, expected: list[str]) -> No
         ["bash", "-c", script + 'printf "%s\\n" "${COMPREPLY[@]}"'], capture_output=True, text=True, check=True
     )
     assert done.stdout.split() == expected
+
+
+@pytest.mark.skipif(shutil.which("zsh") is None, reason="zsh is not here")
+@pytest.mark.parametrize(("typed", "expected"), [*COMPLETED, ("upsample input=clo", ["FILES"])])
+def test_zsh_completes_verbs_keys_and_files(typed: str, expected: list[str]) -> None:
+    words = ["pnu", *typed.split()]
+    script = f"""
+        compdef() {{ }}
+        compadd() {{ print -l -- $@ }}
+        compset() {{ [[ $words[CURRENT] == *=* ]] }}
+        _files() {{ print FILES }}
+        {completion("zsh")}
+        words=({" ".join(words)}); CURRENT={len(words)}; _pnu
+    """
+    done = subprocess.run(["zsh", "-f", "-c", script], capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    offered = done.stdout.split()
+    assert [word for word in offered if word.startswith(words[-1]) or word == "FILES"] == expected

@@ -11,7 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 from pnu.__main__ import verbs
@@ -35,6 +37,12 @@ for verb in set(verbs()) - {"doctor"}:  # which has no keys
     assert "quiet" in said.getvalue() and f"usage: pnu {verb}" in said.getvalue(), said.getvalue()
     print(verb)
 """
+
+
+def test_the_workflow_runs_on_every_python_that_is_asked_for() -> None:
+    asked = SpecifierSet(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"])
+    (job,) = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())["jobs"].values()
+    assert job["strategy"]["matrix"]["python"] == [f"3.{n}" for n in range(30) if f"3.{n}" in asked]
 
 
 def test_everything_that_is_asked_for_has_a_pin_that_fits() -> None:
