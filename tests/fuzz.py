@@ -178,7 +178,7 @@ def gltf_examples() -> list[bytes]:
     import trimesh
 
     box, sphere = trimesh.creation.box(), trimesh.creation.icosphere(1)
-    return [shape.scene().export(file_type="glb") for shape in (box, sphere)]
+    return [shape.scene().export(file_type="glb", include_normals=shape is sphere) for shape in (box, sphere)]
 
 
 def vtk_examples() -> list[bytes]:

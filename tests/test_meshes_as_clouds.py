@@ -71,6 +71,84 @@ def gltf(length: int, uri: str | None, count: int = 8) -> dict:
     }
 
 
+def ball(mode: int, normals: Array | None, matrix: Array) -> tuple[dict, bytes]:
+    """A tree and its buffer: 60 points of a ball, or 20 triangles of them, with normals, as a node places them."""
+    points = np.random.default_rng(0).normal(size=(60, 3))
+    points = (points / np.linalg.norm(points, axis=1, keepdims=True)).astype("<f4")
+    data, attributes, count = points.tobytes(), {"POSITION": 0}, 1
+    if normals is not None:
+        data, attributes, count = data + normals.astype("<f4").tobytes(), attributes | {"NORMAL": 1}, 2
+    tree = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0, 1]}],
+        "nodes": [{"mesh": 0}, {"mesh": 0, "matrix": matrix.T.ravel().tolist()}],
+        "meshes": [{"primitives": [{"attributes": attributes, "mode": mode}]}],
+        "accessors": [
+            {"bufferView": i, "componentType": 5126, "count": 720 // 12, "type": "VEC3"} for i in range(count)
+        ],
+        "bufferViews": [{"buffer": 0, "byteOffset": 720 * i, "byteLength": 720} for i in range(count)],
+        "buffers": [{"byteLength": len(data)}],
+    }
+    return tree, data
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".gltf"])
+@pytest.mark.parametrize("mode", [0, 4])  # points, triangles
+def test_gltf_normals(tmp_path: Path, suffix: str, mode: int) -> None:
+    """Of a ball as it is, and of one that a node makes an ellipsoid, mirrored and moved."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = np.diag([-1.0, 2, 3]), (9, 0, 0)
+    for given in (True, False):
+        points = np.frombuffer(ball(mode, None, matrix)[1], "<f4").reshape(60, 3)
+        tree, data = ball(mode, points if given else None, matrix)
+        path = tmp_path / f"{given}{suffix}"
+        if suffix == ".glb":
+            text = json.dumps(tree).encode().ljust(4000)
+            head = b"glTF" + struct.pack("<IIII", 2, 28 + len(text) + len(data), len(text), 0x4E4F534A)
+            path.write_bytes(head + text + struct.pack("<II", len(data), 0x004E4942) + data)
+        else:
+            (tmp_path / f"{given}.bin").write_bytes(data)
+            tree["buffers"][0]["uri"] = f"{given}.bin"
+            path.write_text(json.dumps(tree))
+        cloud = read_cloud(path)
+        assert len(cloud.points) == 120
+        if not given:
+            assert cloud.normals is None
+            continue
+        assert cloud.normals is not None
+        size = np.where(cloud.points[:, :1] > 4, [-1.0, 2, 3], 1)
+        inner = (cloud.points - [9, 0, 0] * (cloud.points[:, :1] > 4)) / size
+        expected = inner / size
+        expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+        np.testing.assert_allclose(cloud.normals, expected, atol=1e-5)
+        if mode == 4:
+            assert len(read_mesh(path).faces) == 40
+
+
+def test_gltf_normals_that_do_not_fit(tmp_path: Path) -> None:
+    tree, data = ball(0, np.ones((60, 3)), np.eye(4))
+    tree["accessors"][1]["count"] = 59
+    (tmp_path / "m.bin").write_bytes(data)
+    tree["buffers"][0]["uri"] = "m.bin"
+    (tmp_path / "m.gltf").write_text(json.dumps(tree))
+    with pytest.raises(ValueError, match=r"m\.gltf: .*its normals are not as many as its points"):
+        read_cloud(tmp_path / "m.gltf")
+
+
+def test_normals_of_a_gltf_that_only_some_parts_have_are_left_out(tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    box = trimesh.creation.icosphere(2)
+    path = tmp_path / "m.glb"
+    path.write_bytes(box.scene().export(file_type="glb", include_normals=True))
+    cloud = read_cloud(path)
+    assert cloud.normals is not None
+    np.testing.assert_allclose((cloud.normals * cloud.points).sum(1), 1, atol=1e-2)
+    points = trimesh.PointCloud(np.random.default_rng(0).random((50, 3)) + 5)
+    path.write_bytes(trimesh.Scene([box, points]).export(file_type="glb", include_normals=True))
+    assert read_cloud(path).normals is None
+
+
 @pytest.mark.parametrize(
     ("content", "found"),
     [

@@ -264,8 +264,7 @@ def read_stl(path: Path) -> Geometry:
 
 def read_gltf_mesh(path: Path) -> Geometry:
     """The meshes of a glTF file as one."""
-    vertices, faces, colors = read_gltf(path)
-    return Geometry(vertices, faces, None, colors)
+    return Geometry(*read_gltf(path))
 
 
 def read_vtk_mesh(path: Path) -> Geometry:
