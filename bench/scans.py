@@ -75,7 +75,7 @@ def main() -> None:
     found: dict[tuple[str, str], list[dict[str, float]]] = {}
     names = meshes_of(arguments.meshes)
     for name, path in names.items():
-        mesh = shapes.unit(read_mesh(path))
+        mesh = shapes.unit_mesh(read_mesh(path))
         scanner, scene = Scanner(mesh), MeshScene([mesh])
         truth = sample_poisson_disk(mesh, 10000, np.random.default_rng(0))[:, :3]
         for kind in arguments.kinds:
