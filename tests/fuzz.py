@@ -182,19 +182,19 @@ def gltf_examples() -> list[bytes]:
 
 
 def vtk_examples() -> list[bytes]:
-    from tests.test_scanner_formats import legacy
+    from tests.io.test_scanner_formats import legacy
 
     return [legacy(binary, version) for binary in (False, True) for version in (3, 5)]
 
 
 def vtp_examples() -> list[bytes]:
-    from tests.test_scanner_formats import xml
+    from tests.io.test_scanner_formats import xml
 
     return [xml(form, packed) for form in ("ascii", "binary", "appended raw") for packed in (False, True)]
 
 
 def e57_examples() -> list[bytes]:
-    from tests.test_scanner_formats import e57, scan, sphere
+    from tests.io.test_scanner_formats import e57, scan, sphere
 
     return [written(".e57", lambda path: e57(path, [scan(sphere(), None)], np.zeros(3)))]
 

@@ -15,7 +15,7 @@ from pnu.commands.train import Train, main
 from pnu.config.compose import compose_config
 from pnu.config.help_text import help_text
 from pnu.networks.checkpoints import read_checkpoint
-from tests.commands import refused
+from tests.refusals import refused
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
 ALL = ["loss._target_=mylab.Laplacian", "model._target_=mylab.Split", "data._target_=mylab.Spheres", "data.samples=16"]

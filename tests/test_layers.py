@@ -34,6 +34,15 @@ ROOMS = [
 HEAVY = {"torch", "lightning", "hydra", "open3d", "tensorboard", "torchmetrics", "scipy", "h5py", "trimesh"}
 
 
+WHOLE = {"docs", "examples", "extending", "layers", "nightly", "side_effects", "wheel"}  # tests of no room alone
+
+
+def test_tests_mirror_the_rooms() -> None:
+    tests = Path(__file__).parent
+    assert {path.stem.removeprefix("test_") for path in tests.glob("test_*.py")} == WHOLE
+    assert {path.parent.name for path in tests.rglob("test_*.py") if path.parent != tests} <= set(ROOMS)
+
+
 def modules() -> dict[str, Path]:
     names = {}
     for path in PACKAGE.rglob("*.py"):

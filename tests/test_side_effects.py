@@ -10,13 +10,13 @@ import torch
 from torch import nn
 
 import pnu
-from tests.test_inference import Spread, sphere
+from tests.upsamplers.test_inference import Spread, sphere
 
 CALLS = """
 import gc, json, locale, logging, os, random, signal, sys, warnings
 from pathlib import Path
 import numpy as np, torch
-from tests.test_inference import Spread, sphere
+from tests.upsamplers.test_inference import Spread, sphere
 
 def world():
     numpy = np.random.get_state()

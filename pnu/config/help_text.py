@@ -114,7 +114,7 @@ def reference() -> str:
         "",
         "Each group's keys are the arguments of the class that it names, with the words of its constructor; of classes",
         "of libraries those that conf/ sets, and every other may be given too. `PNU_WRITE=1 make test",
-        "ARGS=tests/test_schema.py` writes this page.",
+        "ARGS=tests/config/test_schema.py` writes this page.",
     ]
     for group in sorted(path.name for path in config_folder().iterdir() if path.is_dir()):
         for choice, named in targets(group).items() if group in PACKAGES else ():
