@@ -163,6 +163,7 @@ def test_one_logger_or_none(train: Any) -> None:
     assert not list(train(NONE, run="none").glob("*/events*"))
 
 
+@pytest.mark.slow
 def test_the_average_of_the_weights_is_validated_and_kept_as_the_best(train: Any) -> None:
     options = ["optimizer=sgd", "scheduler=none", "callbacks.checkpoints.every_n_steps=1"]
     run = train(EMA, "callbacks.ema.decay=0.9", *options)
@@ -197,6 +198,7 @@ def initial(run: Path) -> dict[str, torch.Tensor]:
     return build_network(config["model"]).state_dict()
 
 
+@pytest.mark.slow
 def test_a_run_with_an_average_goes_on_as_if_never_stopped(train: Any) -> None:
     whole = train(EMA, "trainer.max_epochs=2", run="whole")
     run = train(EMA)
@@ -263,6 +265,7 @@ def test_what_has_no_use_here_says_why(message: Callable[[str], str]) -> None:
     assert PAGE.read_text(encoding="utf-8") == page, "PNU_WRITE=1 python -m pytest tests/config/test_lightning_hydra.py"
 
 
+@pytest.mark.slow
 def test_every_argument_of_the_trainer_is_known() -> None:
     import inspect
 

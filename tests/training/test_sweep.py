@@ -207,6 +207,7 @@ def test_a_sweep_started_again_skips_what_has_finished(
     assert all(record["status"] == "finished" for record in after.values())
 
 
+@pytest.mark.slow
 def test_killed_in_the_middle_and_started_again(
     patch_file: Path,  # noqa: F811
     tmp_path: Path,

@@ -282,6 +282,7 @@ def test_name_and_date_make_the_folder(train: Train, tmp_path: Path) -> None:
 # --- the same again ---
 
 
+@pytest.mark.slow
 def test_same_seed_same_weights_whatever_the_workers(train: Train) -> None:
     options = ["model.local_features=false", "trainer.max_steps=6"]  # beyond an epoch
     alone = weights(train(*options, run="a"))
@@ -295,9 +296,9 @@ def test_same_seed_same_weights_whatever_the_workers(train: Train) -> None:
 @pytest.mark.parametrize(
     "options",
     [
-        ["trainer.max_epochs=2", "scheduler=onecycle"],
+        pytest.param(["trainer.max_epochs=2", "scheduler=onecycle"], marks=pytest.mark.slow),
         ["trainer.max_steps=6", "trainer.check_val_every_n_epoch=null", "trainer.val_check_interval=3"],
-        ["trainer.max_epochs=2", "trainer.accumulate_grad_batches=2"],
+        pytest.param(["trainer.max_epochs=2", "trainer.accumulate_grad_batches=2"], marks=pytest.mark.slow),
     ],
 )
 def test_a_run_goes_on_from_every_checkpoint_as_if_never_stopped(
