@@ -26,12 +26,12 @@ def estimate_normals(points: Tensor, k: int = 16, *, orient: bool = True) -> Ten
     return torch.stack(planes).to(points)
 
 
-def complete_normals(points: Tensor, normals: Tensor | None) -> Tensor:
+def complete_normals(points: Tensor, normals: Tensor | None, k: int = 16) -> Tensor:
     """Normals (n, 3) of points (n, 3): those given; where None or NaN, estimated."""
     missing = torch.ones(len(points), dtype=torch.bool) if normals is None else normals.isnan().any(1)
     if normals is not None and not missing.any():
         return normals
-    estimated = estimate_normals(points[None])[0]
+    estimated = estimate_normals(points[None], k)[0]
     if normals is None:
         return estimated
     near = (estimated[None, missing], points[None, missing], points[None, ~missing], normals[None, ~missing])

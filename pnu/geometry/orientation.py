@@ -63,6 +63,16 @@ def signs(cloud: NeighborCloud, lines: Tensor) -> Tensor:
     return sign
 
 
+def is_closed(cloud: NeighborCloud, normals: Tensor) -> bool:
+    """Whether oriented normals (n, 3) bound something: as far as Gauss' law holds at an even subset of the points."""
+    if len(normals) > ANCHORS:
+        chosen = torch.from_numpy(farthest_points_large(cloud.points, ANCHORS)).to(normals.device)
+        cloud, normals = NeighborCloud.of(cloud.points[chosen]), normals[chosen]
+    weight = cloud.area.sqrt()
+    winding = torch.cat([_layer(cloud, normals, rows) @ cloud.area for rows in _blocks(normals)])
+    return bool(((winding.abs() - 0.5) * weight).norm() <= OPEN * (0.5 * weight).norm())
+
+
 def _global_signs(cloud: NeighborCloud, lines: Tensor) -> Tensor:
     weight = cloud.area.sqrt()
     layer = torch.cat([_layer(cloud, lines, rows) for rows in _blocks(lines)]).mul_(weight).mul_(weight[:, None])

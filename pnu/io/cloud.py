@@ -41,12 +41,18 @@ class Cloud(NamedTuple):
 
 @np.errstate(invalid="ignore", over="ignore")  # what is not finite is named by the checks
 def read_cloud(
-    path: str | Path, *, minimum: int = 16, normals: bool = True, columns: str | Sequence[str] | None = None
+    path: str | Path,
+    *,
+    minimum: int = 16,
+    normals: bool = True,
+    columns: str | Sequence[str] | None = None,
+    pulses: bool = False,
 ) -> Cloud:
     """Read a point cloud, checked as by `check_cloud`; with `normals=False` without normals.
 
     columns: of text and of arrays without names, such as "x,y,z,_,r,g,b" (_ is left out); None: by the names in the
     file, or by the usual order: x y z, then unit normals, colors and scalars where they stand.
+    pulses: of las also what belongs to the pulse and not to the place: number of returns, scan angle, source ...
     Of a mesh the vertices are taken. Coordinates stay float64.
 
     Raises `ValueError` (one line: file, what was expected, what was found, what to do) for a missing, empty, damaged
@@ -55,7 +61,8 @@ def read_cloud(
     path = Path(path)
     suffix = open_file(path, "point cloud", CLOUD_SUFFIXES)
     if columns is None:
-        cloud = READERS[suffix](path)
+        las = pulses and suffix in (".las", ".laz")
+        cloud = Cloud(*read_las(path, pulses=True)) if las else READERS[suffix](path)
     elif suffix in TABLES:
         cloud = READERS[suffix](path, spelled(columns))  # type: ignore[call-arg]
     else:

@@ -5,7 +5,7 @@ import struct
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,6 +20,12 @@ SLICE_BYTES = 2**28  # at most, whatever size of a point a header claims
 MOST = 100  # points that a byte of laz may hold: bounds what a damaged header makes us allocate
 NORMAL = ("nx", "ny", "nz")  # extra dimensions
 CARRIED = ("intensity", "classification", "gps_time")
+PULSES = (  # of the pulse that a point is from, or of how the file was made: no sense between points
+    *("return_number", "number_of_returns", "scan_angle", "scan_angle_rank", "scan_direction_flag", "user_data"),
+    *("edge_of_flight_line", "point_source_id", "scanner_channel", "synthetic", "key_point", "withheld", "overlap"),
+)
+OBLIQUE = 75  # degrees from straight down: more than scanners look sideways from the air
+RANK = 0.006  # degrees in a step of scan_angle; those of scan_angle_rank, in older formats, are whole ones
 POINTWISE = b"\1\0"  # compressor of a laz without chunks
 MODEL_TYPE = 1024  # geo key: 1 projected, 2 geographic
 FOREIGN = "pnu "  # before the name of a scalar that las has, but not with such values
@@ -37,8 +43,11 @@ def _laspy(path: Path) -> ModuleType:
     return module
 
 
-def read_las(path: Path) -> Content:
-    """Points (n, 3) float64, normals if there are, colors, intensity, class, time and extra scalars, notes."""
+def read_las(path: Path, pulses: bool = False) -> Content:
+    """Points (n, 3) float64, normals if there are, colors, intensity, class, time and extra scalars, notes.
+
+    pulses: also what belongs to the pulse: number of returns, scan angle, source ...
+    """
     laspy = _laspy(path)
     try:
         _check_counts(path)
@@ -46,12 +55,28 @@ def read_las(path: Path) -> Content:
             if file.header.point_count > MOST * path.stat().st_size:
                 raise ValueError(f"its header promises {file.header.point_count} points, more than it has room for")
             notes = (GEOGRAPHIC,) if _geographic(file.header) else ()
-            return (*_content(file.header, _slices(laspy, path, file)), notes)
+            standard = (*CARRIED, *PULSES) if pulses else CARRIED
+            return (*_content(file.header, _slices(laspy, path, file), standard), notes)
     except Exception as error:  # laspy and its decompressors know many kinds
         if isinstance(error, ValueError) and str(error).startswith(f"{path}: is compressed"):
             raise
         reason = (str(error).splitlines() or [""])[0][:80]
         raise ValueError(f"{path}: is no las file that can be read ({reason}); export it again") from None
+
+
+def is_from_the_air(path: Path) -> bool:
+    """Whether pulses had several returns, or were sent at angles as from above: scanners on the ground look around."""
+    laspy = _laspy(path)
+    with laspy.open(path) as file:
+        first = next(_slices(laspy, path, file), None)
+        if first is None:
+            return False
+        known = set(file.header.point_format.dimension_names)
+        angle = (
+            np.asarray(first["scan_angle"]) * RANK if "scan_angle" in known else np.asarray(first["scan_angle_rank"])
+        )
+        steepest = float(np.abs(angle.astype(np.float64)).max())
+        return steepest <= OBLIQUE and (steepest > 0 or int(np.asarray(first["number_of_returns"]).max()) > 1)
 
 
 def _check_counts(path: Path) -> None:
@@ -113,7 +138,9 @@ def _geographic(header: Any) -> bool:
     return False
 
 
-def _content(header: Any, slices: Iterator[Any]) -> tuple[np.ndarray, np.ndarray | None, dict[str, np.ndarray]]:
+def _content(
+    header: Any, slices: Iterator[Any], standard: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray | None, dict[str, np.ndarray]]:
     n = header.point_count
     known = set(header.point_format.dimension_names)
     extra = [name for name in header.point_format.extra_dimension_names if name not in NORMAL]
@@ -129,7 +156,7 @@ def _content(header: Any, slices: Iterator[Any]) -> tuple[np.ndarray, np.ndarray
             normals[part] = np.stack([chunk[name] for name in NORMAL], 1)
         if colors is not None:
             colors[part] = np.stack([chunk[name] for name in COLORS], 1)
-        for name in [*(name for name in CARRIED if name in known and FOREIGN + name not in known), *extra]:
+        for name in [*(name for name in standard if name in known and FOREIGN + name not in known), *extra]:
             values = np.asarray(chunk[name])
             if name not in columns:
                 columns[name] = np.zeros((n, *values.shape[1:]), values.dtype)
@@ -141,6 +168,17 @@ def _content(header: Any, slices: Iterator[Any]) -> tuple[np.ndarray, np.ndarray
     if colors is not None and colors.any():
         attributes["colors"] = (colors if colors.max() < 256 else colors >> 8).astype(np.uint8)
     return points, normals, attributes
+
+
+def _fits(dimension: Any, values: np.ndarray) -> bool:
+    """Whether a dimension of the format holds these values as they are; some have a few bits only."""
+    if values.ndim > 1:
+        return False
+    if dimension.dtype is None or dimension.num_bits < 8:
+        return bool(
+            (values >= 0).all() and (values < 2**dimension.num_bits).all() and (values == values.astype(int)).all()
+        )
+    return bool(np.array_equal(values.astype(dimension.dtype), values))
 
 
 def write_las(
@@ -157,14 +195,17 @@ def write_las(
     extent = max(float((points.max(0) - header.offsets).max()), 1e-9)
     header.scales = np.full(3, 10 ** np.ceil(np.log10(extent / 2**31 * 1.001)))
     known = {dimension.name: dimension for dimension in header.point_format.dimensions}
+    if "scan_angle_rank" in names and "scan_angle" not in names:
+        names["scan_angle_rank"] = "scan_angle"
+        attributes = {
+            **attributes,
+            "scan_angle_rank": np.rint(attributes["scan_angle_rank"] / RANK).clip(-30000, 30000),
+        }
     columns = {}
     for given, values in attributes.items():
         if given != "colors":
             name = names[given]
-            exact = name not in known or (
-                values.ndim == 1 and np.array_equal(values.astype(known[name].dtype or np.uint8), values)
-            )
-            columns[name if exact else FOREIGN + name] = values
+            columns[name if name not in known or _fits(known[name], values) else FOREIGN + name] = values
     if normals is not None:
         columns |= dict(zip(NORMAL, normals.astype(np.float32).T, strict=True))
     header.add_extra_dims(

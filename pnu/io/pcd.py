@@ -9,6 +9,8 @@ from pnu.io.shift import read_shift
 from pnu.io.text import table
 
 KINDS = {"I": "i", "U": "u", "F": "f"}
+HEAD = 2**20  # bytes at most before the points
+UNSAID = (0, 0, 0, 1, 0, 0, 0)  # VIEWPOINT of programs that know of no sensor: place and quaternion
 
 
 def read_pcd(path: Path) -> dict[str, np.ndarray]:
@@ -55,6 +57,21 @@ def read_pcd(path: Path) -> dict[str, np.ndarray]:
     if shift is not None:
         found |= {axis: found[axis] + by for axis, by in zip("xyz", shift, strict=True) if axis in found}
     return found
+
+
+def read_viewpoint(path: Path) -> np.ndarray | None:
+    """Place of the sensor, (3,), with the shift that a comment names; None where the header has the usual zeros."""
+    with path.open("rb") as file:
+        data = file.read(HEAD)
+    header, start = _header(path, data)
+    try:
+        pose = np.array([float(word) for word in header.get("VIEWPOINT", [])])
+    except ValueError:
+        return None
+    if len(pose) != 7 or not np.isfinite(pose).all() or (pose == UNSAID).all():
+        return None
+    shift = read_shift(data[:start].decode("ascii", "replace"))
+    return pose[:3] if shift is None else pose[:3] + shift
 
 
 def _header(path: Path, data: bytes) -> tuple[dict[str, list[str]], int]:

@@ -2,7 +2,7 @@
 
 import copy
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from numbers import Integral, Real
@@ -19,9 +19,11 @@ from pnu import __version__
 from pnu.cleaning import Treatment, clean_cloud
 from pnu.fast import accelerated
 from pnu.geometry.attributes import carry
-from pnu.geometry.normal_estimation import complete_normals, estimate_normals
+from pnu.geometry.cloud_normals import settled_normals
+from pnu.geometry.normal_estimation import complete_normals
 from pnu.geometry.unit_sphere import Frame, unit_sphere_frame
 from pnu.io import Cloud, check_cloud
+from pnu.io.sensor import asked_sight
 from pnu.networks import checkpoints
 from pnu.runtime.parts import Parts
 from pnu.runtime.progress import Progress, silent
@@ -197,13 +199,29 @@ def output_count(n: int, ratio: float) -> int:
     return count
 
 
-def normals(points: np.ndarray, neighbors: int = 16, *, progress: Progress = silent) -> np.ndarray:
-    """Normals of a cloud: estimated, and oriented outward on closed shapes, to one side on open ones.
+def normals(
+    points: np.ndarray,
+    normals: np.ndarray | None = None,
+    *,
+    viewpoint: np.ndarray | Sequence[float] | None = None,
+    up: str | np.ndarray | Sequence[float] | None = None,
+    side: Literal["out", "in"] | None = None,
+    neighbors: int = 16,
+    progress: Progress = silent,
+) -> np.ndarray:
+    """Normals of a cloud: estimated where there are none, with signs that agree.
 
-    Those of `upsample` where it gets none. They depend neither on the order of the points nor on repeated ones.
+    Without anything that decides the side, they look outward on closed shapes, and to one side on open ones; given
+    ones that agree stay as they are, and of those that contradict each other the axes stay. Those of `upsample` where
+    it gets none. They depend neither on the order of the points nor on repeated ones.
 
     Args:
         points: (n, 3), n >= 16, in any unit and anywhere; an array, or a tensor on any device.
+        normals: (n, 3), of any length; estimated where zero or NaN.
+        viewpoint: place of the sensor, (3,), or of the sensor of each point, (n, 3), NaN where it is not known: normals
+            look to where they were seen from.
+        up: the direction from which all was seen, as from the air: "z", "-z", "x" ..., or three numbers.
+        side: "out" or "in", of closed shapes, such as rooms and tunnels; on open ones "in" is the other side.
         neighbors: of the plane fits that begin it, at least 3.
         progress: called as progress(stage, done, total).
 
@@ -227,19 +245,25 @@ def normals(points: np.ndarray, neighbors: int = 16, *, progress: Progress = sil
     array = _array(points, "points: expected an array (n, 3)")
     if array.ndim != 2 or array.shape[1] != 3:
         raise ValueError(f"points: expected an array (n, 3), found shape {array.shape}")
-    different = check_cloud(Cloud(array, None, {}), "points", minimum=MINIMUM).points
-    different = different[np.lexsort(different.T)]
-    unit, _ = _unit_sphere(different)
-    if not (isinstance(neighbors, Integral) and 3 <= neighbors <= len(different)):
+    given = None if normals is None else _array(normals, f"normals: expected an array {array.shape}")
+    asked = asked_sight(viewpoint, up, side)
+    places = {}
+    if asked is not None and asked.viewpoint is not None and asked.viewpoint.ndim == 2:
+        if asked.viewpoint.shape != array.shape:
+            raise ValueError(f"viewpoint: expected (3,) or {array.shape}, found shape {asked.viewpoint.shape}")
+        places = {"viewpoint": asked.viewpoint}
+    cloud = check_cloud(Cloud(array, given, places), "points", minimum=MINIMUM)
+    if asked is not None and places:
+        asked = asked._replace(viewpoint=cloud.attributes["viewpoint"])
+    _unit_sphere(cloud.points.copy())
+    if not (isinstance(neighbors, Integral) and 3 <= neighbors <= len(cloud.points)):
         raise ValueError(
-            f"neighbors={neighbors}: expected a whole number from 3 to {len(different)}, the different points"
+            f"neighbors={neighbors}: expected a whole number from 3 to {len(cloud.points)}, the different points"
         )
-    progress("normals", 0, 1)
-    estimated = estimate_normals(unit, int(neighbors))[0].numpy()
-    progress("normals", 1, 1)
+    settled = settled_normals(cloud.points, cloud.normals, asked=asked, neighbors=int(neighbors), progress=progress)
     finite = np.isfinite(array).all(1)
     found = np.full(array.shape, np.nan)
-    found[finite] = estimated[cKDTree(different).query(array[finite])[1]]  # each point is one of them
+    found[finite] = settled.normals[cKDTree(cloud.points).query(array[finite])[1]]  # each point is one of them
     return found
 
 

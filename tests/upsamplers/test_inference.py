@@ -239,7 +239,7 @@ def test_normals() -> None:
 )
 def test_points_without_normals(points: Array, neighbors: int, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        normals(points, neighbors)
+        normals(points, neighbors=neighbors)
 
 
 def test_progress_reaches_the_end_of_each_stage() -> None:

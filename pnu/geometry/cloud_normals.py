@@ -1,0 +1,119 @@
+"""Normals of a whole cloud: whose axes are taken, what decides their side, and what is to be said of it."""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+
+from pnu.geometry.cloud_statistics import CONTRADICTING, contradicting
+from pnu.geometry.normal_estimation import complete_normals, orient_normals
+from pnu.geometry.normal_sides import repaired_signs, seen_signs
+from pnu.geometry.orientation import NeighborCloud, is_closed
+from pnu.geometry.unit_sphere import unit_sphere_frame
+from pnu.io.sensor import Sight
+from pnu.runtime.progress import Progress, silent
+
+Choice = Literal["auto", "estimate", "orient", "keep"]
+OUTWARD = "outward, by the winding field"
+UP = np.array([0.0, 0.0, 1.0])
+
+
+class Settled(NamedTuple):
+    """normals (n, 3), unit; words: how many are whose, and what decided their side, a line."""
+
+    normals: np.ndarray
+    words: str
+
+
+def settled_normals(
+    points: np.ndarray,
+    normals: np.ndarray | None,
+    *,
+    choice: Choice = "auto",
+    asked: Sight | None = None,
+    found: Sight | None = None,
+    neighbors: int = 16,
+    progress: Progress = silent,
+) -> Settled:
+    """A unit normal for each of different points (n, 3); neither their order nor their unit matters.
+
+    Args:
+        normals: (n, 3) of length 1, NaN where a point has none; None: none has.
+        choice: "auto": axes of those given, their signs where they agree; "orient": their axes, all signs chosen;
+            "keep": as they are; "estimate": none of those given. What is missing is estimated.
+        asked: what shall decide the side of all that are not kept.
+        found: what the file says; it decides where nothing is asked and given signs don't agree, or there are none.
+        neighbors: of the plane fits that estimates begin with.
+        progress: called as progress(stage, done, total).
+    """
+    order = np.lexsort(points.T)
+    cloud = torch.from_numpy(points[order])[None]
+    frame = unit_sphere_frame(cloud)
+    unit = frame.to_unit(cloud)[0]
+    given = None if normals is None or choice == "estimate" else normals[order]
+    known = np.zeros(len(points), bool) if given is None else np.isfinite(given).all(1)
+    share = contradiction(points[order], given) if choice == "auto" and given is not None else 0.0
+    anew = ~known | (choice == "orient") | (choice == "auto" and (asked is not None or share > 0))
+    progress("normals", 0, 1)
+    lines = complete_normals(unit, None if given is None else torch.from_numpy(given), neighbors)
+    sight = asked or found or (Sight("up, as a map of heights", up=UP) if is_height_map(points) else None)
+    if sight is not None and sight.viewpoint is not None:
+        center, scale = frame.center[0, 0].numpy(), float(frame.scale)
+        places = sight.viewpoint[order] if sight.viewpoint.ndim == 2 else sight.viewpoint
+        sight = sight._replace(viewpoint=(places - center) / scale)
+    sign, side = _signs(unit, lines, known, anew, sight, share)
+    progress("normals", 1, 1)
+    sign = np.where(anew, sign, 1)
+    settled = np.empty(points.shape)
+    settled[order] = lines.numpy() * sign[:, None]
+    return Settled(settled, _words(known, int((sign[known] < 0).sum()), share, side))
+
+
+def contradiction(points: np.ndarray, normals: np.ndarray) -> float:
+    """Share of neighboring pairs of normals (n, 3) that contradict each other, 0 where no more than of right ones."""
+    known = np.isfinite(normals).all(1)
+    share = contradicting(points[known], normals[known]) if known.any() else 0.0
+    return share if share > CONTRADICTING else 0.0
+
+
+def is_height_map(points: np.ndarray) -> bool:
+    """Whether points (n, 3) are heights z, one for each place of a grid in x and y, a third of which they fill."""
+    x, y = np.unique(points[:, 0]), np.unique(points[:, 1])
+    if len(x) * len(y) > 3 * len(points) or min(len(x), len(y)) < 3:
+        return False
+    cells = np.searchsorted(x, points[:, 0]) * len(y) + np.searchsorted(y, points[:, 1])
+    return len(np.unique(cells)) == len(points)
+
+
+def _signs(
+    unit: torch.Tensor, lines: torch.Tensor, known: np.ndarray, anew: np.ndarray, sight: Sight | None, share: float
+) -> tuple[np.ndarray, str]:
+    """A sign for each line, and what decided those that are anew."""
+    same = np.ones(len(known))
+    if not anew.any():
+        return same, ""
+    if sight is not None and sight.inward is None:
+        return seen_signs(unit.numpy(), lines.numpy(), viewpoint=sight.viewpoint, up=sight.up), sight.words
+    if sight is None and known.any() and not anew[known].any():
+        return same, "as the nearest given"
+    if sight is None and share > 0:
+        sign, by = repaired_signs(unit.numpy(), lines.numpy())
+        return sign, OUTWARD if by == "outward" else "that of most given"
+    oriented = orient_normals(unit, lines) if known.any() else lines
+    sign = np.where((oriented * lines).sum(1).numpy() < 0, -1.0, 1.0)
+    if sight is not None:
+        return (-sign if sight.inward else sign), sight.words
+    closed = is_closed(NeighborCloud.of(unit), oriented.float())
+    return sign, OUTWARD if closed else "one and the same over an open surface"
+
+
+def _words(known: np.ndarray, turned: int, share: float, side: str) -> str:
+    given, estimated = int(known.sum()), int((~known).sum())
+    parts = [f"{given} given"] if given else []
+    if turned:
+        why = f", as {share:.1%} of neighbors contradicted each other" if share else ""
+        parts.append(f"{turned} of them turned over{why}")
+    elif given:
+        parts.append("none of them turned over")
+    parts += [f"{estimated} estimated"] if estimated else []
+    return ", ".join(parts) + (f"; side: {side}" if side else "")
