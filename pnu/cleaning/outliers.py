@@ -16,7 +16,7 @@ from pnu.networks.outlier_detector import OutlierDetector
 WEIGHTS = Path(__file__).with_name("outliers.safetensors")
 SURE = 3.0  # logarithm of the odds from which on a point is taken for stray,
 LIKELY = 1.2  # or this where there are many: a share of
-MANY = 0.01  # of the points is sure
+MANY = 0.0035  # of the points is sure; noise of 1 % of the radius stays below
 ROUNDS = 3  # a stray point hides another
 PIECE = 12  # points below which a piece that stands apart is stray
 APART = 6.0  # usual spacings between a piece and all others
