@@ -21,6 +21,7 @@ class Cleaned(NamedTuple):
 
     cloud: Cloud  # its notes say what was done
     stray: NDArray[np.int64]  # rows of the cloud before that were taken out as stray
+    lined: bool = False  # scan lines were thinned out
 
 
 def clean_cloud(cloud: Cloud, *, outliers: Treatment = "auto", lines: Treatment = "auto") -> Cleaned:
@@ -54,4 +55,4 @@ def clean_cloud(cloud: Cloud, *, outliers: Treatment = "auto", lines: Treatment 
             f"lies in lines: {len(rows)} points, less dense along them, stand for {len(cloud.points)} (lines=keep)"
         )
         cloud = chosen(cloud, rows)._replace(points=averaged(cloud.points, rows))
-    return Cleaned(cloud._replace(notes=tuple(notes)), stray)
+    return Cleaned(cloud._replace(notes=tuple(notes)), stray, rows is not None)

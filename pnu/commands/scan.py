@@ -57,7 +57,7 @@ def scan(cfg: Any) -> None:
 
     wanted = cfg.ratio if cfg.spacing is None else whole_clouds.ratio_of_spacing(before.points, cfg.spacing)
     count = whole_clouds.output_count(len(before.points), wanted)
-    cloud, stray = clean_cloud(before)
+    cloud, stray, lined = clean_cloud(before)
     look = describe_cloud(cloud.points, cloud.normals)
     for text in (*cloud.notes, str(look), *look.warnings()):
         say(f"        {text}")
@@ -67,6 +67,7 @@ def scan(cfg: Any) -> None:
     with stages(cfg.quiet) as progress:
         dense = whole_clouds.upsample(
             cloud.points, cloud.normals, ratio=count / len(cloud.points), outliers="keep", lines="keep",
+            model=whole_clouds.weights_source("surface", cloud.normals, lined),
             seed=cfg.seed, progress=progress,
         )  # fmt: skip
     say(f"dense:  {len(dense)} points with unit normals, {time.perf_counter() - started:.1f} s")

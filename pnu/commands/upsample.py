@@ -90,7 +90,7 @@ def upsample(cfg: Any) -> None:
     wanted = cfg.ratio if cfg.spacing is None else whole_clouds.ratio_of_spacing(cloud.points, cfg.spacing)
     count, before = whole_clouds.output_count(len(cloud.points), wanted), cloud
     keep = {"true": True, "false": False}.get(str(cfg.keep).lower(), cfg.keep)
-    cloud, stray = clean_cloud(cloud, outliers=cfg.outliers, lines="keep" if keep is True else cfg.lines)
+    cloud, stray, lined = clean_cloud(cloud, outliers=cfg.outliers, lines="keep" if keep is True else cfg.lines)
     for note in cloud.notes[len(before.notes) :]:
         say(f"        {note}")
     if cfg.removed is not None:
@@ -102,7 +102,7 @@ def upsample(cfg: Any) -> None:
     say(f"        {look}")
     for text in look.warnings():
         say(f"        {text}")
-    run = whole_clouds.weights_source(cfg.run, cloud.normals)
+    run = whole_clouds.weights_source(cfg.run, cloud.normals, lined)
     chosen = (
         " (the newest finished one)"
         if cfg.run == NEWEST

@@ -17,6 +17,7 @@ from pnu.geometry.anisotropy import averaged, evenness, thinned_lines
 from pnu.geometry.mesh_sampling import sample_area
 from pnu.geometry.outlier_features import FEATURES, NEIGHBORS, outlier_features
 from pnu.io import Cloud, read_cloud
+from pnu.upsamplers.whole_clouds import weights_source
 
 
 def sphere(n: int, seed: int = 0) -> np.ndarray:
@@ -153,3 +154,13 @@ def test_scans_have_the_truth_beside_them(kind: str) -> None:
     if kind in ("orbit", "oneview", "lines"):
         toward = scan.sensor - scan.clean[:, :3]
         assert ((toward * scan.clean[:, 3:]).sum(1) > 0).all()  # a sensor sees the side that faces it
+
+
+def test_lined_clouds_take_weights_of_their_own() -> None:
+    cleaned = clean_cloud(Cloud(lines(noise=0.001), None, {}))
+    assert cleaned.lined
+    assert weights_source("surface", None, cleaned.lined) == "surface_scans"
+    assert weights_source("surface", None) == "surface_estimated"
+    dense = pnu.upsample(lines(noise=0.001), ratio=1)
+    inside = (np.abs(dense[:, :2] - 0.5) < 0.45).all(1)
+    assert np.abs(dense[inside, 2]).mean() < 0.0006  # of 0.0008
