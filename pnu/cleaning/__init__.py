@@ -1,4 +1,4 @@
-"""What is done to a cloud before it becomes denser: stray points taken out, scan lines evened out. And said."""
+"""What is done to a cloud before it becomes denser, and said: strays taken out, lines thinned, normals turned."""
 
 from typing import Literal, NamedTuple
 
@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from pnu.cleaning.outliers import stray_points
 from pnu.geometry.anisotropy import averaged, thinned_lines
+from pnu.geometry.cloud_normals import contradiction, settled_normals
 from pnu.io import Cloud
 from pnu.io.cloud import chosen
 
@@ -24,8 +25,10 @@ class Cleaned(NamedTuple):
     lined: bool = False  # scan lines were thinned out
 
 
-def clean_cloud(cloud: Cloud, *, outliers: Treatment = "auto", lines: Treatment = "auto") -> Cleaned:
-    """A cloud without its stray points (`outliers`), and with its scan lines thinned out (`lines`).
+def clean_cloud(
+    cloud: Cloud, *, outliers: Treatment = "auto", lines: Treatment = "auto", signs: Treatment = "auto"
+) -> Cleaned:
+    """A cloud without stray points (`outliers`), with lines thinned out (`lines`) and normals that agree (`signs`).
 
     Lines are found where points are several times as dense along one direction as across it. As many points stay as lie
     about as far apart along lines as across; each moves to the mean of the points that it stands for, which takes most
@@ -35,11 +38,12 @@ def clean_cloud(cloud: Cloud, *, outliers: Treatment = "auto", lines: Treatment 
         cloud: as `pnu.io.check_cloud` gives it.
         outliers: auto: stray points are taken out; keep: all stay.
         lines: auto: thinned out; keep: as they are.
+        signs: auto: of normals that contradict each other the axes are kept and the sides chosen anew; keep: as given.
 
     Raises:
         ValueError: a treatment is neither auto nor keep, or hardly a point is none of the stray ones.
     """
-    for name, value in (("outliers", outliers), ("lines", lines)):
+    for name, value in (("outliers", outliers), ("lines", lines), ("signs", signs)):
         if value not in TREATMENTS:
             raise ValueError(f"{name}={value}: expected auto or keep")
     stray = np.flatnonzero(stray_points(cloud.points)) if outliers == "auto" else np.empty(0, np.int64)
@@ -55,4 +59,8 @@ def clean_cloud(cloud: Cloud, *, outliers: Treatment = "auto", lines: Treatment 
             f"lies in lines: {len(rows)} points, less dense along them, stand for {len(cloud.points)} (lines=keep)"
         )
         cloud = chosen(cloud, rows)._replace(points=averaged(cloud.points, rows))
+    if signs == "auto" and cloud.normals is not None and contradiction(cloud.points, cloud.normals):
+        settled = settled_normals(cloud.points, cloud.normals)
+        notes.append(f"normals: {settled.words} (normals=keep)")
+        cloud = cloud._replace(normals=settled.normals)
     return Cleaned(cloud._replace(notes=tuple(notes)), stray, rows is not None)

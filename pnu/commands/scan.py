@@ -66,7 +66,7 @@ def scan(cfg: Any) -> None:
         io.write_cloud(cfg.removed, before.points[stray], None, gone)
     with stages(cfg.quiet) as progress:
         dense = whole_clouds.upsample(
-            cloud.points, cloud.normals, ratio=count / len(cloud.points), outliers="keep", lines="keep",
+            cloud.points, cloud.normals, ratio=count / len(cloud.points), outliers="keep", lines="keep", signs="keep",
             model=whole_clouds.weights_source("surface", cloud.normals, lined),
             seed=cfg.seed, progress=progress,
         )  # fmt: skip

@@ -38,7 +38,10 @@ class Upsample:
         "of surface: true: the points read are among those written, unmoved; false: all are new; "
         "auto: kept where evenly spread and without noise"
     )
-    normals: str = doc("auto: the file's, estimated where it has none; estimate: always estimated")
+    normals: str = doc(
+        "auto: the file's, estimated where it has none, turned over where they contradict each other; "
+        "keep: never turned; estimate: always estimated"
+    )
     columns: str | None = doc(
         "of text, or an array without names: x,y,z,_,r,g,b (_ is left out); null: by its names or the usual order"
     )
@@ -61,8 +64,8 @@ def upsample(cfg: Any) -> None:
 
     started = time.perf_counter()
     say: Callable[[str], None] = (lambda text: None) if cfg.quiet else print
-    if cfg.normals not in ("auto", "estimate"):
-        raise ValueError(f"normals={cfg.normals}: expected auto or estimate")
+    if cfg.normals not in ("auto", "keep", "estimate"):
+        raise ValueError(f"normals={cfg.normals}: expected auto, keep or estimate")
     if not 1 <= cfg.ratio < float("inf"):  # here too: the network's libraries take seconds to load
         raise ValueError(f"ratio={cfg.ratio:g}: expected a number >= 1, the points out for each point in")
     io.check_output(cfg.output)
@@ -72,9 +75,9 @@ def upsample(cfg: Any) -> None:
         if path is not None and Path(path).resolve() == Path(cfg.input).resolve():
             raise ValueError(f"{name}={path}: is the input; give another name")
     if cfg.sample is None:
-        cloud = io.read_cloud(cfg.input, normals=cfg.normals == "auto", columns=cfg.columns)
+        cloud = io.read_cloud(cfg.input, normals=cfg.normals != "estimate", columns=cfg.columns)
     else:
-        cloud = _sampled(cfg.input, cfg.sample, cfg.normals == "auto", cfg.seed)
+        cloud = _sampled(cfg.input, cfg.sample, cfg.normals != "estimate", cfg.seed)
     origin = "with normals" if cloud.normals is not None else "normals estimated and oriented"
     say(f"input:  {cfg.input}, {len(cloud.points)} points, {origin}")
     for note in cloud.notes:
@@ -90,7 +93,12 @@ def upsample(cfg: Any) -> None:
     wanted = cfg.ratio if cfg.spacing is None else whole_clouds.ratio_of_spacing(cloud.points, cfg.spacing)
     count, before = whole_clouds.output_count(len(cloud.points), wanted), cloud
     keep = {"true": True, "false": False}.get(str(cfg.keep).lower(), cfg.keep)
-    cloud, stray, lined = clean_cloud(cloud, outliers=cfg.outliers, lines="keep" if keep is True else cfg.lines)
+    cloud, stray, lined = clean_cloud(
+        cloud,
+        outliers=cfg.outliers,
+        lines="keep" if keep is True else cfg.lines,
+        signs="keep" if cfg.normals == "keep" else "auto",
+    )
     for note in cloud.notes[len(before.notes) :]:
         say(f"        {note}")
     if cfg.removed is not None:
@@ -124,6 +132,7 @@ def upsample(cfg: Any) -> None:
             keep=keep,
             outliers="keep",
             lines="keep",
+            signs="keep",
             model=checkpoints.load(run, cfg.allow) if cfg.allow else run,
             patch_size=cfg.patch_size,
             device=cfg.device,

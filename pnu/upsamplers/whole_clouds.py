@@ -49,6 +49,7 @@ def upsample(
     keep: bool | Literal["auto"] = "auto",
     outliers: Treatment = "auto",
     lines: Treatment = "auto",
+    signs: Treatment = "auto",
     device: str = "auto",
     devices: int = 1,
     batch_size: int | None = None,
@@ -80,6 +81,8 @@ def upsample(
             between; False: all are new; "auto": kept where they are evenly spread and show no noise.
         outliers: "auto": stray points are taken out first, and not counted less for it: n stays; "keep": none is.
         lines: "auto": scan lines, dense along and sparse across, are thinned out first; "keep": they stay.
+        signs: "auto": where given normals contradict each other, their axes are kept and their sides chosen anew;
+            "keep": they are taken as they are.
         device: "auto" (where the given network is; else CUDA where there is one), "cpu", "cuda", "cuda:1" ...
         devices: CUDA devices, or processes on the CPU, that share the work of the network; the result is the same for
             any number. More than one needs `if __name__ == "__main__":` in a script.
@@ -121,7 +124,7 @@ def upsample(
         raise ValueError(f"density={density}: expected {', '.join(DENSITIES)}")
     if keep not in (True, False, "auto"):
         raise ValueError(f"keep={keep}: expected true, false or auto")
-    given, _, lined = clean_cloud(given, outliers=outliers, lines="keep" if keep is True else lines)
+    given, _, lined = clean_cloud(given, outliers=outliers, lines="keep" if keep is True else lines, signs=signs)
     network, target = _on_device(*_model(model, given.normals, lined), device)
     upsampler = upsampler_of(network, patch_size)
     if devices > 1 and not getattr(upsampler, "parallel", False):

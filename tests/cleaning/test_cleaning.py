@@ -164,3 +164,18 @@ def test_lined_clouds_take_weights_of_their_own() -> None:
     dense = pnu.upsample(lines(noise=0.001), ratio=1)
     inside = (np.abs(dense[:, :2] - 0.5) < 0.45).all(1)
     assert np.abs(dense[inside, 2]).mean() < 0.0006  # of 0.0008
+
+
+def test_normals_that_contradict_each_other_are_turned_their_axes_kept() -> None:
+    points = sphere(2000)
+    wrong = (points[:, 0] > 0.3) & (points[:, 1] > 0.2)
+    given = np.where(wrong[:, None], -points, points)
+    given[::7] *= -1
+    cleaned = clean_cloud(Cloud(points, given, {})).cloud
+    assert cleaned.normals is not None
+    assert ((cleaned.normals * points).sum(1) > 0.999).all()
+    assert "turned over" in cleaned.notes[-1]
+    kept = clean_cloud(Cloud(points, given, {}), signs="keep").cloud
+    assert kept.normals is given
+    dense = pnu.upsample(points, given, ratio=2)
+    assert ((dense[:, :3] * dense[:, 3:]).sum(1) > 0.9).all()
