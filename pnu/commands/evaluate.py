@@ -119,7 +119,7 @@ def _check_options(cfg: Any) -> None:
         if cfg[key] not in known:
             raise ValueError(f"{key}={cfg[key]}: expected {' or '.join(known)}")
     if cfg.run and cfg.method:
-        raise ValueError(f"run={cfg.run} and method={cfg.method}: expected one of them; pnu.compare takes several")
+        raise ValueError(f"run={cfg.run} and method={cfg.method}: expected one of them; `pnu compare` takes several")
     if not 1 <= cfg.ratio < float("inf"):
         raise ValueError(f"ratio={cfg.ratio:g}: expected a number >= 1, the points out for each point in")
 

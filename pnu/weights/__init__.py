@@ -49,7 +49,9 @@ def read(path: str | PathLike[str]) -> Weights:
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: expected weights as safetensors, found {' '.join(str(error).split())}") from error
     if not isinstance(config, dict):
-        raise ValueError(f"{path}: expected weights written by pnu.export, found no network's config in their metadata")
+        raise ValueError(
+            f"{path}: expected weights written by `pnu export`, found no network's config in their metadata"
+        )
     if patch_size is not None and not (type(patch_size) is int and patch_size > 0):
         raise ValueError(f"{path}: expected a whole number of points as patch_size in the metadata, found {patch_size}")
     return Weights(config, patch_size, state)

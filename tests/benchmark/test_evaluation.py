@@ -460,7 +460,7 @@ def test_command_with_a_method_twice_is_the_same(place: Path, capsys: pytest.Cap
     ("arguments", "text"),
     [
         (["method=aps"], "method=aps: expected one of apss, poisson, midpoint"),
-        (["method=apss", "run=outputs/small"], "expected one of them; pnu.compare takes several"),
+        (["method=apss", "run=outputs/small"], "expected one of them; `pnu compare` takes several"),
         (["run=outputs/small", *SMALL], "ratio=4: outputs/small was trained for 2; give ratio=2, or passes=true"),
         (["run=nowhere"], "run=nowhere: expected a run folder"),
         (["method=apss", "output=file/deep"], "output=file/deep: cannot be made a folder (Not a directory)"),

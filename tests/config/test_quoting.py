@@ -197,7 +197,7 @@ def in_nasty(name: str) -> str:
 
 @pytest.fixture(scope="module")
 def training(patch_file: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:  # noqa: F811
-    """A run that the line of pnu.prepare trained, and what it printed."""
+    """A run that the line of `pnu prepare` trained, and what it printed."""
     folder = tmp_path_factory.mktemp("trained")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)

@@ -481,7 +481,7 @@ def test_a_checkpoint_that_cannot_be_written_is_no_success(
 
     run = train("trainer.max_steps=2")
     before = (run / "checkpoints/last.ckpt").read_bytes()
-    monkeypatch.setattr("pnu.training.callbacks.write", write)
+    monkeypatch.setattr("pnu.training.callbacks.write_checkpoint", write)
     with pytest.raises(SystemExit) as stopped:
         resume(run, "trainer.max_steps=3")
     assert stopped.value.code == 2

@@ -67,7 +67,7 @@ def test_broken_and_foreign_files_are_refused(place: Path) -> None:
     with pytest.raises(ValueError, match=r"broken\.safetensors: expected weights as safetensors"):
         pnu.load("broken.safetensors")
     save_file({"a": torch.zeros(1)}, "foreign.safetensors")
-    with pytest.raises(ValueError, match=r"foreign\.safetensors: expected weights written by pnu\.export"):
+    with pytest.raises(ValueError, match=r"foreign\.safetensors: expected weights written by `pnu export`"):
         pnu.load("foreign.safetensors")
     weights.write("other.safetensors", MODEL | {"width": 8}, Surface(12, 12, 12, 16).state_dict())
     with pytest.raises(ValueError, match=r"other\.safetensors: expected the state of Surface"):
