@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from pnu.geometry.cloud_statistics import CONTRADICTING, contradicting
+from pnu.geometry.flipped_parts import flipped_share
 from pnu.geometry.normal_estimation import complete_normals, orient_normals
 from pnu.geometry.normal_sides import repaired_signs, seen_signs
 from pnu.geometry.orientation import NeighborCloud, is_closed
@@ -52,8 +53,8 @@ def settled_normals(
     unit = frame.to_unit(cloud)[0]
     given = None if normals is None or choice == "estimate" else normals[order]
     known = np.zeros(len(points), bool) if given is None else np.isfinite(given).all(1)
-    share = contradiction(points[order], given) if choice == "auto" and given is not None else 0.0
-    anew = ~known | (choice == "orient") | (choice == "auto" and (asked is not None or share > 0))
+    why = contradiction(unit.numpy(), given) if choice == "auto" and given is not None else ""
+    anew = ~known | (choice == "orient") | (choice == "auto" and (asked is not None or bool(why)))
     progress("normals", 0, 1)
     lines = complete_normals(unit, None if given is None else torch.from_numpy(given), neighbors)
     sight = asked or found or (Sight("up, as a map of heights", up=UP) if is_height_map(points) else None)
@@ -61,19 +62,24 @@ def settled_normals(
         center, scale = frame.center[0, 0].numpy(), float(frame.scale)
         places = sight.viewpoint[order] if sight.viewpoint.ndim == 2 else sight.viewpoint
         sight = sight._replace(viewpoint=(places - center) / scale)
-    sign, side = _signs(unit, lines, known, anew, sight, share)
+    sign, side = _signs(unit, lines, known, anew, sight, repair=bool(why))
     progress("normals", 1, 1)
     sign = np.where(anew, sign, 1)
     settled = np.empty(points.shape)
     settled[order] = lines.numpy() * sign[:, None]
-    return Settled(settled, _words(known, int((sign[known] < 0).sum()), share, side))
+    return Settled(settled, _words(known, int((sign[known] < 0).sum()), why, side))
 
 
-def contradiction(points: np.ndarray, normals: np.ndarray) -> float:
-    """Share of neighboring pairs of normals (n, 3) that contradict each other, 0 where no more than of right ones."""
+def contradiction(points: np.ndarray, normals: np.ndarray) -> str:
+    """How unit normals (n, 3), NaN where there is none, contradict each other, in words; empty where they don't."""
     known = np.isfinite(normals).all(1)
-    share = contradicting(points[known], normals[known]) if known.any() else 0.0
-    return share if share > CONTRADICTING else 0.0
+    if not known.any():
+        return ""
+    points, normals = points[known], normals[known]
+    if flipped := flipped_share(points, normals):
+        return f"at least {flipped:.0%} looked to the other side than those beside them"
+    share = contradicting(points, normals)
+    return f"{share:.0%} of neighbors contradicted each other" if share > CONTRADICTING else ""
 
 
 def is_height_map(points: np.ndarray) -> bool:
@@ -86,7 +92,7 @@ def is_height_map(points: np.ndarray) -> bool:
 
 
 def _signs(
-    unit: torch.Tensor, lines: torch.Tensor, known: np.ndarray, anew: np.ndarray, sight: Sight | None, share: float
+    unit: torch.Tensor, lines: torch.Tensor, known: np.ndarray, anew: np.ndarray, sight: Sight | None, *, repair: bool
 ) -> tuple[np.ndarray, str]:
     """A sign for each line, and what decided those that are anew."""
     same = np.ones(len(known))
@@ -96,7 +102,7 @@ def _signs(
         return seen_signs(unit.numpy(), lines.numpy(), viewpoint=sight.viewpoint, up=sight.up), sight.words
     if sight is None and known.any() and not anew[known].any():
         return same, "as the nearest given"
-    if sight is None and share > 0:
+    if sight is None and repair:
         sign, by = repaired_signs(unit.numpy(), lines.numpy())
         return sign, OUTWARD if by == "outward" else "that of most given"
     oriented = orient_normals(unit, lines) if known.any() else lines
@@ -107,12 +113,11 @@ def _signs(
     return sign, OUTWARD if closed else "one and the same over an open surface"
 
 
-def _words(known: np.ndarray, turned: int, share: float, side: str) -> str:
+def _words(known: np.ndarray, turned: int, why: str, side: str) -> str:
     given, estimated = int(known.sum()), int((~known).sum())
     parts = [f"{given} given"] if given else []
     if turned:
-        why = f", as {share:.1%} of neighbors contradicted each other" if share else ""
-        parts.append(f"{turned} of them turned over{why}")
+        parts.append(f"{turned} of them turned over" + (f" ({why})" if why else ""))
     elif given:
         parts.append("none of them turned over")
     parts += [f"{estimated} estimated"] if estimated else []

@@ -123,6 +123,7 @@ PLACES = {
     "commands/upsample.py upsample": "test_from_patches_to_a_picture",
     "commands/reconstruct.py reconstruct": "test_from_patches_to_a_picture",
     "commands/scan.py scan": "test_a_scan_then_a_picture",
+    "commands/normals.py normals": "test_normals_then_a_denser_cloud",
     "commands/export.py export": "test_weights_kept_as_a_file",
     "commands/convert.py convert": "test_weights_of_the_released_code",
     "commands/evaluate.py evaluate": "test_an_evaluation_then_a_comparison",
@@ -230,6 +231,12 @@ def test_a_scan_then_a_picture(say: Say) -> None:
     made = say(shell_line("scan", input="cloud.ply", output=in_nasty("mesh.ply")), "ratio=1", "depth=4")
     say(printed(made), "size=64")
     assert Path("picture.png").stat().st_size > 0
+
+
+def test_normals_then_a_denser_cloud(say: Say) -> None:
+    made = say(shell_line("normals", input="cloud.ply", output=in_nasty("normals.ply"), viewpoint="0,0,-3"))
+    say(printed(made), "ratio=1")
+    assert len(read_cloud("dense.ply").points) == len(read_cloud(in_nasty("normals.ply")).points)
 
 
 def test_weights_kept_as_a_file(say: Say, trained: str) -> None:

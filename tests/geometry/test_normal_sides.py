@@ -191,8 +191,8 @@ def test_what_is_done_is_said() -> None:
     given = points * sign[:, None]
     turned = int((sign < 0).sum())
     repaired = settled_normals(points, given)
-    assert f"1000 given, {turned} of them turned over, as 4" in repaired.words
-    assert repaired.words.endswith("of neighbors contradicted each other; side: outward, by the winding field")
+    assert f"1000 given, {turned} of them turned over (4" in repaired.words
+    assert repaired.words.endswith("of neighbors contradicted each other); side: outward, by the winding field")
     np.testing.assert_array_equal(repaired.normals, points)
     assert settled_normals(points, points).words == "1000 given, none of them turned over"
     np.testing.assert_array_equal(settled_normals(points, given, choice="keep").normals, given)
@@ -213,6 +213,15 @@ def test_what_is_done_is_said() -> None:
     np.testing.assert_array_equal(some.normals[1::2], points[1::2])
     sheet = np.hstack([np.random.default_rng(7).uniform(-1, 1, (500, 2)), np.zeros((500, 1))])
     assert settled_normals(sheet, None).words == "500 estimated; side: one and the same over an open surface"
+
+
+def test_a_part_that_looks_to_the_other_side_is_found_and_turned() -> None:
+    points = sphere(3000)
+    sign = np.where(points[:, 0] > 0.4, -1.0, 1.0)
+    found = settled_normals(points, points * sign[:, None])
+    assert f"{(sign < 0).sum()} of them turned over (at least 3" in found.words
+    assert "looked to the other side than those beside them); side: outward" in found.words
+    np.testing.assert_array_equal(found.normals, points)
 
 
 def test_a_map_of_heights_is_seen_from_above() -> None:
