@@ -36,8 +36,8 @@ def thinned_lines(points: NDArray[np.float64]) -> NDArray[np.int64] | None:
     for share in SHARES:
         kept = order[: max(round(share * len(points)), AROUND + 1)]
         if evenness(points[kept]) > EVEN:
-            break
-    return np.sort(kept)
+            return np.sort(kept)
+    return None  # a single line, say: no subset of it lies on a surface
 
 
 def averaged(points: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.float64]:
