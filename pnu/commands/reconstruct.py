@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+from pnu.commands import _sides
 from pnu.commands._entry import command, warn
 from pnu.config.quoting import shell_line
 from pnu.config.schema import doc
@@ -16,12 +17,15 @@ from pnu.runtime.progress import busy
 class Reconstruct:
     """Make a triangle mesh from a point cloud file, and measure it against the true surface where there is one."""
 
-    commas: ClassVar = ("columns",)
+    commas: ClassVar = ("columns", "viewpoint")
     input: str = doc(
         "cloud to read: ply, text (xyz, csv, pts ...), pcd, las, laz, e57, npy, npz; of a mesh its vertices"
     )
     output: str = doc("mesh to write: ply (keeps colors and errors), obj, off or stl")
-    normals: str = doc("auto: the file's, estimated where it has none; estimate: always estimated")
+    normals: str = doc(_sides.NORMALS)
+    viewpoint: str | None = doc(_sides.VIEWPOINT)
+    up: str | None = doc(_sides.UP)
+    side: str | None = doc(_sides.SIDE)
     columns: str | None = doc(
         "of text, or an array without names: x,y,z,_,r,g,b (_ is left out); null: by its names or the usual order"
     )
@@ -53,25 +57,23 @@ def reconstruct(cfg: Any) -> None:
     started = time.perf_counter()
     say: Callable[[str], None] = (lambda text: None) if cfg.quiet else print
     _check_options(cfg)
-    points, normals, attributes, notes = io.read_cloud(cfg.input, normals=cfg.normals == "auto", columns=cfg.columns)
-    origin = "with normals" if normals is not None else "normals estimated and oriented"
-    say(f"input:  {cfg.input}, {len(points)} points, {origin}")
-    for note in notes:
+    cloud = io.read_cloud(cfg.input, normals=cfg.normals != "estimate", columns=cfg.columns)
+    origin = "with normals" if cloud.normals is not None else "normals estimated and oriented"
+    say(f"input:  {cfg.input}, {len(cloud.points)} points, {origin}")
+    for note in cloud.notes:
         say(f"        {note}")
-    for text in describe_cloud(points, normals).warnings():
-        warn(text)
-    truth = None
+    points, truth = cloud.points, None
     if cfg.truth:
         truth = io.read_mesh(cfg.truth)
         if holes := open_edges(truth):
             warn(f"{cfg.truth}: is not watertight ({holes} open edges); errors are large where surface is missing")
         reconstruction.check_frame(points, truth, name=cfg.input, truth_name=cfg.truth)
-    if normals is None:
-        import torch
-
-        from pnu.geometry.normal_estimation import estimate_normals
-
-        normals = estimate_normals(torch.from_numpy(points)[None])[0].numpy()
+    settled, _ = _sides.sided(cfg, cloud)
+    for note in settled.notes[len(cloud.notes) :]:
+        say(f"        {note}")
+    normals = np.asarray(settled.normals)
+    for text in describe_cloud(points, normals).warnings():
+        warn(text)
     depth = reconstruction.octree_depth(points) if cfg.depth is None else cfg.depth
     with busy(f"Poisson reconstruction, depth {depth}", cfg.quiet):
         surface = reconstruction.reconstruct(points, normals, depth=depth, timeout=cfg.timeout, name=cfg.input)
@@ -86,8 +88,9 @@ def reconstruct(cfg: Any) -> None:
         say(f"trim:   {before} vertices before, {len(surface.mesh.vertices)} after")
     mesh = surface.mesh
     extra: dict[str, Any] = {}
-    if "colors" in attributes:
-        extra["colors"] = reconstruction.interpolated_values(points, attributes["colors"][:, :3], mesh.vertices) / 255
+    if "colors" in cloud.attributes:
+        colors = cloud.attributes["colors"][:, :3]
+        extra["colors"] = reconstruction.interpolated_values(points, colors, mesh.vertices) / 255
     if truth is not None:
         errors = reconstruction.surface_errors(mesh, truth, rng=np.random.default_rng(cfg.seed))
         extra = {"quality": errors.distance, "colors": errors.colors(cfg.limit, cfg.colormap)}
@@ -100,8 +103,6 @@ def reconstruct(cfg: Any) -> None:
     say(f"output: {cfg.output}, {counts}, {time.perf_counter() - started:.1f} s")
     for note in notes:
         say(f"        {note}")
-    for text in describe_cloud(points, normals).warnings():
-        warn(text)
     names = {"columns": cfg.columns} if cfg.columns else {}
     say(f"next:   {shell_line('picture', inputs=[cfg.input, cfg.output], output='picture.png', **names)}")
 
@@ -111,8 +112,7 @@ def _check_options(cfg: Any) -> None:
     from pnu.io import MESH_OUTPUTS, check_writable
     from pnu.rendering.colors import COLORMAPS
 
-    if cfg.normals not in ("auto", "estimate"):
-        raise ValueError(f"normals={cfg.normals}: expected auto or estimate")
+    _sides.check_sides(cfg)
     if cfg.colormap not in COLORMAPS:
         raise ValueError(f"colormap={cfg.colormap}: expected {' or '.join(COLORMAPS)}")
     if cfg.reach is not None and not cfg.reach > 0:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+from pnu.commands import _sides
 from pnu.commands._entry import command, warn
 from pnu.config.quoting import shell_line
 from pnu.config.schema import doc
@@ -16,7 +17,7 @@ from pnu.runtime.progress import busy, stages
 class Scan:
     """From a scan to its surface: cleaned, with normals, dense, a mesh; each step says what it found and did."""
 
-    commas: ClassVar = ("columns",)
+    commas: ClassVar = ("columns", "viewpoint")
     input: str = doc("scan to read: ply, text (xyz, csv, pts ...), pcd, las, laz, e57, npy, npz")
     output: str = doc("mesh to write: ply (keeps colors), obj, off or stl")
     cloud: str | None = doc("file for the dense cloud with normals; null: none is written")
@@ -24,7 +25,10 @@ class Scan:
     removed: str | None = doc("file for the points that were taken out; null: none is written")
     ratio: float = doc("points of the dense cloud for each point of the scan, any number >= 1")
     spacing: float | None = doc("instead of ratio: the distance wanted between points, in the scan's unit")
-    normals: str = doc("auto: the file's, estimated where it has none; estimate: always estimated")
+    normals: str = doc(_sides.NORMALS)
+    viewpoint: str | None = doc(_sides.VIEWPOINT)
+    up: str | None = doc(_sides.UP)
+    side: str | None = doc(_sides.SIDE)
     columns: str | None = doc(
         "of text, or an array without names: x,y,z,_,r,g,b (_ is left out); null: by its names or the usual order"
     )
@@ -46,18 +50,17 @@ def scan(cfg: Any) -> None:
     started = time.perf_counter()
     say: Callable[[str], None] = (lambda text: None) if cfg.quiet else print
     check_files(cfg)
-    before = io.read_cloud(cfg.input, normals=cfg.normals == "auto", columns=cfg.columns)
+    before = io.read_cloud(cfg.input, normals=cfg.normals != "estimate", columns=cfg.columns)
     origin = "with normals" if before.normals is not None else "without normals"
     say(f"scan:   {cfg.input}, {len(before.points)} points, {origin}")
 
     from pnu import reconstruction
-    from pnu.cleaning import clean_cloud
     from pnu.geometry.cloud_statistics import describe_cloud
     from pnu.upsamplers import whole_clouds
 
     wanted = cfg.ratio if cfg.spacing is None else whole_clouds.ratio_of_spacing(before.points, cfg.spacing)
     count = whole_clouds.output_count(len(before.points), wanted)
-    cloud, stray, lined = clean_cloud(before)
+    (cloud, stray, lined), own = _sides.cleaned(cfg, before)
     look = describe_cloud(cloud.points, cloud.normals)
     for text in (*cloud.notes, str(look), *look.warnings()):
         say(f"        {text}")
@@ -67,7 +70,7 @@ def scan(cfg: Any) -> None:
     with stages(cfg.quiet) as progress:
         dense = whole_clouds.upsample(
             cloud.points, cloud.normals, ratio=count / len(cloud.points), outliers="keep", lines="keep", signs="keep",
-            model=whole_clouds.weights_source("surface", cloud.normals, lined),
+            model=whole_clouds.weights_source("surface", own, lined),
             seed=cfg.seed, progress=progress,
         )  # fmt: skip
     say(f"dense:  {len(dense)} points with unit normals, {time.perf_counter() - started:.1f} s")
@@ -108,8 +111,7 @@ def check_files(cfg: Any) -> None:
     """Refuse what can be refused before the work begins."""
     from pnu.io import MESH_OUTPUTS, check_output, check_writable
 
-    if cfg.normals not in ("auto", "estimate"):
-        raise ValueError(f"normals={cfg.normals}: expected auto or estimate")
+    _sides.check_sides(cfg)
     if not 1 <= cfg.ratio < float("inf"):
         raise ValueError(f"ratio={cfg.ratio:g}: expected a number >= 1, the points out for each point in")
     if cfg.reach is not None and not cfg.reach > 0:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from pnu.commands import _sides
 from pnu.commands._entry import command
 from pnu.config.quoting import shell_line
 from pnu.config.schema import doc
@@ -23,7 +24,7 @@ class Upsample:
     """Densify a point cloud file with a trained network; `model=NAME` is `run=NAME`."""
 
     also: ClassVar = {"model": "run"}
-    commas: ClassVar = ("columns",)
+    commas: ClassVar = ("columns", "viewpoint")
     input: str = doc(
         "file to read: ply, text (xyz, csv, pts ...), pcd, las, laz, e57, npy, npz; of a mesh its vertices"
     )
@@ -38,10 +39,10 @@ class Upsample:
         "of surface: true: the points read are among those written, unmoved; false: all are new; "
         "auto: kept where evenly spread and without noise"
     )
-    normals: str = doc(
-        "auto: the file's, estimated where it has none, turned over where they contradict each other; "
-        "keep: never turned; estimate: always estimated"
-    )
+    normals: str = doc(_sides.NORMALS)
+    viewpoint: str | None = doc(_sides.VIEWPOINT)
+    up: str | None = doc(_sides.UP)
+    side: str | None = doc(_sides.SIDE)
     columns: str | None = doc(
         "of text, or an array without names: x,y,z,_,r,g,b (_ is left out); null: by its names or the usual order"
     )
@@ -64,8 +65,7 @@ def upsample(cfg: Any) -> None:
 
     started = time.perf_counter()
     say: Callable[[str], None] = (lambda text: None) if cfg.quiet else print
-    if cfg.normals not in ("auto", "keep", "estimate"):
-        raise ValueError(f"normals={cfg.normals}: expected auto, keep or estimate")
+    _sides.check_sides(cfg)
     if not 1 <= cfg.ratio < float("inf"):  # here too: the network's libraries take seconds to load
         raise ValueError(f"ratio={cfg.ratio:g}: expected a number >= 1, the points out for each point in")
     io.check_output(cfg.output)
@@ -84,7 +84,6 @@ def upsample(cfg: Any) -> None:
         say(f"        {note}")
 
     from pnu import weights
-    from pnu.cleaning import clean_cloud
     from pnu.geometry.cloud_statistics import describe_cloud
     from pnu.networks import checkpoints
     from pnu.networks.checkpoints import NEWEST
@@ -93,11 +92,8 @@ def upsample(cfg: Any) -> None:
     wanted = cfg.ratio if cfg.spacing is None else whole_clouds.ratio_of_spacing(cloud.points, cfg.spacing)
     count, before = whole_clouds.output_count(len(cloud.points), wanted), cloud
     keep = {"true": True, "false": False}.get(str(cfg.keep).lower(), cfg.keep)
-    cloud, stray, lined = clean_cloud(
-        cloud,
-        outliers=cfg.outliers,
-        lines="keep" if keep is True else cfg.lines,
-        signs="keep" if cfg.normals == "keep" else "auto",
+    (cloud, stray, lined), own = _sides.cleaned(
+        cfg, cloud, outliers=cfg.outliers, lines="keep" if keep is True else cfg.lines
     )
     for note in cloud.notes[len(before.notes) :]:
         say(f"        {note}")
@@ -110,7 +106,7 @@ def upsample(cfg: Any) -> None:
     say(f"        {look}")
     for text in look.warnings():
         say(f"        {text}")
-    run = whole_clouds.weights_source(cfg.run, cloud.normals, lined)
+    run = whole_clouds.weights_source(cfg.run, own, lined)
     chosen = (
         " (the newest finished one)"
         if cfg.run == NEWEST

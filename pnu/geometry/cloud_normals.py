@@ -20,10 +20,11 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 class Settled(NamedTuple):
-    """normals (n, 3), unit; words: how many are whose, and what decided their side, a line."""
+    """Normals, and what is to be said of them."""
 
-    normals: np.ndarray
-    words: str
+    normals: np.ndarray  # (n, 3) of length 1
+    words: str  # a line: how many are whose, how many were turned over, what decided their side
+    side: str  # what decided that; empty where all are as given
 
 
 def settled_normals(
@@ -55,6 +56,8 @@ def settled_normals(
     known = np.zeros(len(points), bool) if given is None else np.isfinite(given).all(1)
     why = contradiction(unit.numpy(), given) if choice == "auto" and given is not None else ""
     anew = ~known | (choice == "orient") | (choice == "auto" and (asked is not None or bool(why)))
+    if given is not None and not anew.any():
+        return Settled(np.array(normals, np.float64), _words(known, 0, "", ""), "")
     progress("normals", 0, 1)
     lines = complete_normals(unit, None if given is None else torch.from_numpy(given), neighbors)
     sight = asked or found or (Sight("up, as a map of heights", up=UP) if is_height_map(points) else None)
@@ -67,7 +70,7 @@ def settled_normals(
     sign = np.where(anew, sign, 1)
     settled = np.empty(points.shape)
     settled[order] = lines.numpy() * sign[:, None]
-    return Settled(settled, _words(known, int((sign[known] < 0).sum()), why, side))
+    return Settled(settled, _words(known, int((sign[known] < 0).sum()), why, side), side)
 
 
 def contradiction(points: np.ndarray, normals: np.ndarray) -> str:
@@ -96,8 +99,6 @@ def _signs(
 ) -> tuple[np.ndarray, str]:
     """A sign for each line, and what decided those that are anew."""
     same = np.ones(len(known))
-    if not anew.any():
-        return same, ""
     if sight is not None and sight.inward is None:
         return seen_signs(unit.numpy(), lines.numpy(), viewpoint=sight.viewpoint, up=sight.up), sight.words
     if sight is None and known.any() and not anew[known].any():

@@ -14,7 +14,6 @@ PLACES = tuple(
     tuple(f"{name}{axis}" for axis in "xyz")
     for name in ("sensor_", "vp_", "viewpoint_", "scanner_", "sensor_origin_", "camera_", "sensor", "vp")
 )
-CHOICES = ("auto", "estimate", "orient", "keep")  # what `normals=` may be
 AXES = {f"{minus}{'xyz'[axis]}": (-1) ** len(minus) * np.eye(3)[axis] for minus in ("", "-") for axis in range(3)}
 
 

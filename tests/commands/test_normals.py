@@ -1,5 +1,6 @@
 """`pnu normals` on real files: the same points with normals, whatever decides their side."""
 
+import importlib
 import re
 import subprocess
 import sys
@@ -9,8 +10,10 @@ import numpy as np
 import pytest
 
 from pnu.commands.normals import main
-from pnu.io import read_cloud, write_cloud
+from pnu.geometry.mesh_sampling import signed_volume
+from pnu.io import read_cloud, read_mesh, write_cloud
 from pnu.io.sensor import sight_of
+from pnu.runtime.system_libraries import open3d_error
 from tests.refusals import refused
 
 Array = np.ndarray
@@ -222,7 +225,7 @@ BAD = {
     "up=w": "up=w: expected x, y, z, -x, -y or -z, the axis that points up",
     "side=left": "side=left: expected out or in, the side of closed shapes to look to",
     "up=z side=in": "up= and side=: both decide the side of normals; give one of them",
-    "normals=maybe": "normals=maybe: expected auto, estimate, orient, keep",
+    "normals=maybe": "normals=maybe: expected auto, orient, estimate or keep",
     "output=mixed.ply": "output=mixed.ply: is the input; give another name",
     "output=no/out.ply": "no/out.ply: the folder no does not exist; create it",
     "input=no.ply": "no.ply: no such file; give the path of a point cloud",
@@ -237,6 +240,76 @@ def test_what_is_wrong_is_one_line(place: Path, keys: str, capsys: pytest.Captur
     given = {"input": "mixed.ply", "output": "out.ply"} | dict(key.split("=") for key in keys.split())
     assert refused(capsys, main, [f"{key}={value}" for key, value in given.items()]).startswith(f"error: {BAD[keys]}")
     assert sorted(place.iterdir()) == before
+
+
+def notes(capsys: pytest.CaptureFixture[str], command: str, *keys: str) -> str:
+    """The line on normals that a command prints; empty where there is none."""
+    importlib.import_module(f"pnu.commands.{command}").main([*keys])
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines() if line.strip().startswith("normals: ")]
+    assert len(lines) < 2
+    return lines[0] if lines else ""
+
+
+def test_upsample_takes_the_same_keys(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    keys = ("output=dense.ply", "ratio=1.5", "outliers=keep")
+    turned = f"normals: 600 given, {(SIGN < 0).sum()} of them turned over ("
+    assert notes(capsys, "upsample", "input=mixed.ply", *keys).startswith(turned)
+    assert outward("dense.ply") == 1
+    assert notes(capsys, "upsample", "input=mixed.ply", "normals=keep", *keys) == ""
+    assert outward("dense.ply") < 0.9
+    line = notes(capsys, "upsample", "input=bare.ply", "viewpoint=447321.25,5411934.5,313", *keys)
+    assert line == "normals: 600 estimated; side: towards the sensor at 447321.25,5411934.5,313"
+    assert outward("dense.ply") == 0
+    line = notes(capsys, "upsample", "input=mixed.ply", "up=z", "normals=orient", *keys)
+    assert line.endswith("of them turned over; side: up=z")
+    assert notes(capsys, "upsample", "input=bare.ply", *keys) == ""
+    assert outward("dense.ply") == 1
+
+
+def test_upsample_takes_weights_for_estimated_normals_where_the_file_has_none(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    upsample = importlib.import_module("pnu.commands.upsample").main
+    for keys in (["input=bare.ply"], ["input=bare.ply", "side=in"], ["input=mixed.ply", "normals=estimate", "up=z"]):
+        upsample([*keys, "output=dense.ply", "ratio=1"])
+        assert "run:    surface_estimated (comes with pnu)" in capsys.readouterr().out
+    upsample(["input=mixed.ply", "side=in", "output=dense.ply", "ratio=1"])
+    assert "run:    surface (comes with pnu)" in capsys.readouterr().out
+
+
+def test_what_a_las_says_is_enough_for_upsample(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    las("c.las", scan_angle_rank=ANGLES, return_number=1, number_of_returns=1)
+    line = notes(capsys, "upsample", "input=c.las", "output=dense.ply", "ratio=2")
+    assert line.endswith("estimated; side: up, as seen from the air (scan angles or several returns)")
+    normals = read_cloud("dense.ply").normals
+    assert normals is not None
+    assert (normals[:, 2] > 0).all()
+    assert set(read_cloud("dense.ply").attributes) <= {"intensity", "classification", "gps_time"}
+
+
+@pytest.mark.skipif(bool(open3d_error()), reason="open3d's system libraries are missing")
+def test_reconstruct_and_scan_take_the_same_keys(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    keys = ("output=mesh.ply", "depth=5")
+    line = notes(capsys, "reconstruct", "input=mixed.ply", *keys)
+    assert line.startswith(f"normals: 600 given, {(SIGN < 0).sum()} of them turned over (")
+    assert signed_volume(read_mesh("mesh.ply")) == pytest.approx(4 / 3 * np.pi, rel=0.1)
+    line = notes(capsys, "reconstruct", "input=bare.ply", "viewpoint=447321.25,5411934.5,320", *keys)
+    assert line == "normals: 600 estimated; side: towards the sensor at 447321.25,5411934.5,320"
+    line = notes(capsys, "scan", "input=bare.ply", "side=out", "ratio=1", "cloud=dense.ply", *keys)
+    assert line == "normals: 600 estimated; side: outward, side=out"
+    assert outward("dense.ply") == 1
+    assert notes(capsys, "scan", "input=bare.ply", "ratio=1", *keys) == ""
+
+
+@pytest.mark.parametrize("command", ["upsample", "reconstruct", "scan"])
+@pytest.mark.parametrize("keys", ["viewpoint=1,2", "up=w", "side=left", "up=z side=in"])
+def test_other_commands_refuse_the_same(
+    place: Path, command: str, keys: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["input=mixed.ply", "output=mesh.ply", *keys.split()]
+    found = refused(capsys, importlib.import_module(f"pnu.commands.{command}").main, line)
+    assert found.startswith(f"error: {BAD[keys]}")
+    assert not Path("mesh.ply").exists()
 
 
 def test_what_cannot_be_used_is_left_out_and_said(place: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -107,7 +107,7 @@ def test_open_truth_and_inward_normals_are_said(
         ({"trim": 1.5}, "trim=1.5: expected a share"),
         ({"limit": -1}, "limit=-1: expected a distance above 0"),
         ({"colormap": "jet"}, "colormap=jet: expected error or perceptual"),
-        ({"normals": "none"}, "normals=none: expected auto or estimate"),
+        ({"normals": "none"}, "normals=none: expected auto, orient, estimate or keep"),
         ({"timeout": 0.01}, "took longer than timeout=0.01 seconds"),
         ({"trum": 0}, "did you mean 'trim'"),
     ],

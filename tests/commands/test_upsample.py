@@ -94,7 +94,7 @@ BAD = {
     "same": (("input=cloud.ply", "output=./cloud.ply"), "output=./cloud.ply: is the input; give another name"),
     "ratio": ((*GOOD, "ratio=0.5"), "ratio=0.5: expected a number >= 1, the points out for each point in"),
     "ratio text": ((*GOOD, "ratio=many"), "ratio=many: expected float"),
-    "normals": ((*GOOD, "normals=maybe"), "normals=maybe: expected auto, keep or estimate"),
+    "normals": ((*GOOD, "normals=maybe"), "normals=maybe: expected auto, orient, estimate or keep"),
     "key": ((*GOOD, "ratoi=2"), "unknown key 'ratoi': did you mean 'ratio'?"),
     "missing": (("input=cloud.ply",), "output=... is required"),
     "no run": ((*GOOD, "run=nowhere"), "run=nowhere: expected a run folder, such as outputs/<date>/<time>_<name>"),

@@ -1,0 +1,65 @@
+"""The keys of several commands that decide the side of normals: what they may be, and what they do to a cloud."""
+
+from typing import TYPE_CHECKING, Any
+
+from pnu.runtime.progress import stages
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from pnu.cleaning import Cleaned
+    from pnu.io import Cloud
+
+CHOICES = ("auto", "orient", "estimate", "keep")
+NORMALS = (
+    "auto: the file's, turned over where they contradict each other, estimated where missing; orient: the file's axes, "
+    "all sides chosen; estimate: all estimated; keep: the file's as they are"
+)
+VIEWPOINT = "x,y,z, place of the sensor: normals look to where they were seen from; null: where the file says so"
+UP = "x, y, z, -x, -y or -z: the direction from which all was seen, as from the air; null: of airborne scans"
+SIDE = "out or in: of closed shapes, in for rooms and tunnels; of open ones in is the other side; null: out"
+
+
+def check_sides(cfg: Any) -> None:
+    """Refuse values of normals=, viewpoint=, up= and side= before the work begins."""
+    from pnu.io.sensor import asked_sight
+
+    if cfg.normals not in CHOICES:
+        raise ValueError(f"normals={cfg.normals}: expected {', '.join(CHOICES[:-1])} or {CHOICES[-1]}")
+    asked_sight(cfg.viewpoint, cfg.up, cfg.side)
+
+
+def sided(cfg: Any, cloud: "Cloud") -> tuple["Cloud", str]:
+    """A cloud with a normal for each point, as the keys and the file say, and a line on them, which is the last of its
+    notes where something was done."""
+    from pnu.geometry.cloud_normals import settled_normals
+    from pnu.io.sensor import asked_sight, sight_of
+
+    with stages(cfg.quiet) as progress:
+        settled = settled_normals(
+            cloud.points,
+            cloud.normals,
+            choice=cfg.normals,
+            asked=asked_sight(cfg.viewpoint, cfg.up, cfg.side),
+            found=sight_of(cfg.input, cloud.attributes),
+            progress=progress,
+        )
+    line = f"normals: {settled.words}"
+    return cloud._replace(normals=settled.normals, notes=(*cloud.notes, *[line] * bool(settled.side))), line
+
+
+def cleaned(cfg: Any, cloud: "Cloud", **treatments: Any) -> tuple["Cleaned", "NDArray[np.float64] | None"]:
+    """A cloud as `clean_cloud` leaves it, and the normals of its own that it then has.
+
+    Where keys or file say more of the side of normals than the shape of the cloud does, each point has a normal.
+    """
+    from pnu.cleaning import clean_cloud
+    from pnu.geometry.cloud_normals import is_height_map
+    from pnu.io.sensor import asked_sight, sight_of
+
+    told = asked_sight(cfg.viewpoint, cfg.up, cfg.side) is not None or cfg.normals == "orient"
+    told = told or sight_of(cfg.input, cloud.attributes) is not None or is_height_map(cloud.points)
+    found = clean_cloud(cloud, **treatments, signs="keep" if told or cfg.normals == "keep" else "auto")
+    own = found.cloud.normals
+    return (found._replace(cloud=sided(cfg, found.cloud)[0]) if told else found), own
