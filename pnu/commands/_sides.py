@@ -27,7 +27,9 @@ def check_sides(cfg: Any) -> None:
 
     if cfg.normals not in CHOICES:
         raise ValueError(f"normals={cfg.normals}: expected {', '.join(CHOICES[:-1])} or {CHOICES[-1]}")
-    asked_sight(cfg.viewpoint, cfg.up, cfg.side)
+    if asked_sight(cfg.viewpoint, cfg.up, cfg.side) is not None and cfg.normals == "keep":
+        name = next(name for name in ("viewpoint", "up", "side") if cfg[name] is not None)
+        raise ValueError(f"{name}={cfg[name]}: decides nothing where normals=keep; take normals=orient")
 
 
 def sided(cfg: Any, cloud: "Cloud") -> tuple["Cloud", str]:

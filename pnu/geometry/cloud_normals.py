@@ -47,6 +47,9 @@ def settled_normals(
         found: what the file says; it decides where nothing is asked and given signs don't agree, or there are none.
         neighbors: of the plane fits that estimates begin with.
         progress: called as progress(stage, done, total).
+
+    Raises:
+        ValueError: all points lie on a line.
     """
     order = np.lexsort(points.T)
     cloud = torch.from_numpy(points[order])[None]
@@ -58,6 +61,9 @@ def settled_normals(
     anew = ~known | (choice == "orient") | (choice == "auto" and (asked is not None or bool(why)))
     if given is not None and not anew.any():
         return Settled(np.array(normals, np.float64), _words(known, 0, "", ""), "")
+    extent = torch.linalg.svdvals(unit - unit.mean(0))
+    if extent[1] < 1e-9 * extent[0]:
+        raise ValueError(f"points: all {len(points)} points lie on a line; expected points on a surface")
     progress("normals", 0, 1)
     lines = complete_normals(unit, None if given is None else torch.from_numpy(given), neighbors)
     sight = asked or found or (Sight("up, as a map of heights", up=UP) if is_height_map(points) else None)

@@ -258,7 +258,6 @@ def normals(
     cloud = check_cloud(Cloud(array, given, places), "points", minimum=MINIMUM)
     if asked is not None and places:
         asked = asked._replace(viewpoint=cloud.attributes["viewpoint"])
-    _unit_sphere(cloud.points.copy())
     if not (isinstance(neighbors, Integral) and 3 <= neighbors <= len(cloud.points)):
         raise ValueError(
             f"neighbors={neighbors}: expected a whole number from 3 to {len(cloud.points)}, the different points"

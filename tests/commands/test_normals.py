@@ -225,6 +225,7 @@ BAD = {
     "up=w": "up=w: expected x, y, z, -x, -y or -z, the axis that points up",
     "side=left": "side=left: expected out or in, the side of closed shapes to look to",
     "up=z side=in": "up= and side=: both decide the side of normals; give one of them",
+    "viewpoint=1,2,3 normals=keep": "viewpoint=1,2,3: decides nothing where normals=keep; take normals=orient",
     "normals=maybe": "normals=maybe: expected auto, orient, estimate or keep",
     "output=mixed.ply": "output=mixed.ply: is the input; give another name",
     "output=no/out.ply": "no/out.ply: the folder no does not exist; create it",
@@ -310,6 +311,12 @@ def test_other_commands_refuse_the_same(
     found = refused(capsys, importlib.import_module(f"pnu.commands.{command}").main, line)
     assert found.startswith(f"error: {BAD[keys]}")
     assert not Path("mesh.ply").exists()
+
+
+def test_points_on_a_line_have_no_normals(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.savetxt("line.xyz", np.arange(40)[:, None] * [1.0, 2, 3])
+    line = refused(capsys, main, ["input=line.xyz", "output=out.ply"])
+    assert line == "error: points: all 40 points lie on a line; expected points on a surface"
 
 
 def test_what_cannot_be_used_is_left_out_and_said(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
