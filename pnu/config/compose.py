@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import lru_cache
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -29,17 +30,28 @@ EXTRAS = dict.fromkeys(("joblib", "submitit_local", "submitit_slurm", "optuna"),
 
 @contextmanager
 def composer(name: str, extra_folder: str | None = None) -> Iterator[Callable[..., Any]]:
-    """Gives compose(overrides) -> DictConfig for conf/<name>.yaml; Hydra's long errors become one-line ValueErrors."""
+    """Gives compose(overrides) -> DictConfig for conf/<name>.yaml; Hydra's long errors become one-line ValueErrors.
+
+    What it gives is shared by all who ask for the same, and read-only.
+    """
     import hydra
     from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException, MissingConfigException
+    from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
     search_path = [f"hydra.searchpath=[file://{Path(extra_folder).absolute()}]"] if extra_folder else []
+    # files of an extra folder may change between two commands of a process, those of pnu do not
+    composed = composed_afresh if extra_folder else composed_once
 
     def compose(overrides: list[str], return_hydra_config: bool = False) -> Any:
         try:
-            return hydra.compose(name, [*overrides, *search_path], return_hydra_config)
+            cfg = composed(name, (*overrides, *search_path))
+            if return_hydra_config:
+                return cfg
+            own = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+            OmegaConf.set_struct(own, True)
+            return own
         except MissingConfigException as error:
             group, _, choice = (error.missing_cfg_file or "?").rpartition("/")
             if group in ("hydra/launcher", "hydra/sweeper") and choice in EXTRAS:
@@ -57,6 +69,19 @@ def composer(name: str, extra_folder: str | None = None) -> Iterator[Callable[..
             yield compose
     finally:
         GlobalHydra.instance().hydra = before
+
+
+def composed_afresh(name: str, overrides: tuple[str, ...]) -> Any:
+    """conf/<name>.yaml with overrides, Hydra's own config too, read-only; Hydra is initialized."""
+    import hydra
+    from omegaconf import OmegaConf
+
+    cfg = hydra.compose(name, list(overrides), return_hydra_config=True)
+    OmegaConf.set_readonly(cfg, True)
+    return cfg
+
+
+composed_once = lru_cache(maxsize=64)(composed_afresh)  # a command asks several times, at a quarter of a second each
 
 
 def compose_config(
