@@ -3,6 +3,7 @@
 from pnu.benchmark.case_sources import PARTS, CaseSource, case_source
 from pnu.benchmark.cases import KINDS, Case, Truth, mesh_cases, pair_cases, truth_of_mesh
 from pnu.benchmark.measuring import Method, Row, evaluate, measure, network_upsampler
+from pnu.benchmark.protocols import Protocol, print_published
 from pnu.benchmark.result_tables import columns, legend, print_tables, result_folder, summarize, write_results
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "Case",
     "CaseSource",
     "Method",
+    "Protocol",
     "Row",
     "Truth",
     "case_source",
@@ -21,6 +23,7 @@ __all__ = [
     "mesh_cases",
     "network_upsampler",
     "pair_cases",
+    "print_published",
     "print_tables",
     "result_folder",
     "summarize",

@@ -5,7 +5,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pnu.benchmark.cases import KINDS, Case, Warn, is_pairs_folder, mesh_cases, pair_cases, pair_files
+from pnu.benchmark.cases import KINDS, Case, mesh_cases, pair_cases
+from pnu.benchmark.pair_folders import Warn, is_pairs_folder, pair_files, pair_folders
 from pnu.data import shapes
 from pnu.data.patch_dataset import split_shapes
 from pnu.io import Mesh, meshes_of, read_mesh
@@ -35,6 +36,8 @@ def case_source(
     normals: bool = True,
     columns: str | None = None,
     warn: Warn = print,
+    inputs: str = "poisson",
+    noise_limit: float | None = None,
 ) -> CaseSource:
     """Cases of `data`, drawn as they are asked for; what is wrong with the arguments is said at once.
 
@@ -50,6 +53,7 @@ def case_source(
         seed: of all that is drawn.
         normals: whether inputs have normals.
         columns: of prepared clouds that are text or arrays without names, such as "x,y,z,_,nx,ny,nz".
+        inputs: how they are drawn from meshes, noise_limit: greatest offset by noise; see `pnu.benchmark.Protocol`.
     """
     if unknown := [kind for kind in kinds if kind not in KINDS]:
         raise ValueError(f"kinds={unknown[0]}: expected some of {', '.join(KINDS)}")
@@ -63,7 +67,7 @@ def case_source(
         root = Path(data["root"])
         paths = pair_files(root)
         names = chosen_names([path.stem for path in paths], data, part or "all", only)
-        columns_of([path for path in paths if path.stem in names], columns, f"{root}/clouds")
+        columns_of([path for path in paths if path.stem in names], columns, str(pair_folders(root).inputs))
         return CaseSource(root.resolve().name, names, ["given"], pair_cases(root, names, columns=columns, **options))
     if columns is not None:
         raise ValueError(f"columns={columns}: is for prepared pairs, data=meshes data.root=FOLDER with clouds/, truth/")
@@ -81,7 +85,12 @@ def case_source(
         )
     names = chosen_names(list(makers), data, part, only)
     makers = {shape: makers[shape] for shape in names}
-    return CaseSource(name, names, list(kinds), mesh_cases(makers, kinds, points=points, **options))
+    return CaseSource(
+        name,
+        names,
+        list(kinds),
+        mesh_cases(makers, kinds, points=points, inputs=inputs, noise_limit=noise_limit, **options),
+    )
 
 
 def chosen_names(names: list[str], data: Mapping[str, Any], part: str, only: Sequence[str] | None) -> list[str]:

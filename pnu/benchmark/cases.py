@@ -1,6 +1,5 @@
 """What is evaluated: true surfaces, and input clouds drawn from them or read beside them."""
 
-import itertools
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -10,22 +9,22 @@ import numpy as np
 import torch
 
 from pnu import reconstruction
+from pnu.benchmark.pair_folders import PairFolders, Warn, named_count, pair_files, pair_folders
 from pnu.geometry.mesh_sampling import face_areas, sample_area, sample_poisson_disk
 from pnu.geometry.mesh_topology import open_edges
 from pnu.geometry.sampling import nonuniform_points
 from pnu.geometry.unit_sphere import Frame
-from pnu.io import CLOUD_SUFFIXES, MESH_SUFFIXES, Mesh, files_of, read_cloud, read_mesh
+from pnu.io import MESH_SUFFIXES, Mesh, files_of, read_cloud, read_mesh
 from pnu.io.cloud import columns_of
 
-KINDS = ("uniform", "random", "nonuniform", "sparse", "noise_0.5", "noise_1")
+KINDS = ("uniform", "random", "nonuniform", "sparse", "noise_0.5", "noise_1", "noise_2")
 """Kinds of input: evenly spread (Poisson-disk), random by area, denser around three places, evenly spread with a
-quarter of the points, evenly spread with Gaussian noise of 0.5 % and 1 % of the radius in each coordinate."""
+quarter of the points, evenly spread with Gaussian noise of 0.5 %, 1 % and 2 % of the radius in each coordinate.
+Evenly spread where the protocol says so: it may have them random, or a subset of the truth's."""
 
 STRENGTH, CENTERS, CANDIDATES = 2.0, 3, 4  # nonuniform: e^2 times denser, around 3 points, out of 4 times as many
 UNIT = 0.01  # how far a unit sphere's radius may be from 1, and its usual centers from the origin
 NEARLY = 0.05  # how far the radius about the centroid may be from 1 where no usual center is the origin
-
-Warn = Callable[[str], None]
 
 
 class Truth(NamedTuple):
@@ -35,6 +34,7 @@ class Truth(NamedTuple):
     mesh: Mesh | None
     samples: np.ndarray  # (m, 6) evenly spread points with normals, or (m, 3) without
     frame: str  # the frame in words
+    unit: float = 1.0  # length of the frame's unit in that of the files
 
 
 class Case(NamedTuple):
@@ -55,19 +55,24 @@ def mesh_cases(
     seed: int = 0,
     normals: bool = True,
     warn: Warn = print,
+    inputs: str = "poisson",
+    noise_limit: float | None = None,
 ) -> Iterator[Case]:
     """Inputs of all kinds from each mesh, brought to its unit sphere; drawn by (seed, shape, kind) alone.
 
-    normals: with the true normals of the surface (also beside noisy points), or without.
+    normals: with the true normals of the surface (also beside noisy points), or without. inputs, noise_limit: see
+    `pnu.benchmark.Protocol`.
     """
     for shape, make in meshes.items():
         truth = truth_of_mesh(shape, make(), truth_points, seed, warn=warn)
         for kind in kinds:
-            cloud = draw_input(truth, kind, points, generator(seed, shape, kind))
+            cloud = draw_input(truth, kind, points, generator(seed, shape, kind), inputs, noise_limit)
             yield Case(kind, cloud[:, :3], cloud[:, 3:] if normals else None, truth)
 
 
-def draw_input(truth: Truth, kind: str, n: int, rng: np.random.Generator) -> np.ndarray:
+def draw_input(
+    truth: Truth, kind: str, n: int, rng: np.random.Generator, inputs: str = "poisson", noise_limit: float | None = None
+) -> np.ndarray:
     """An input of one of `KINDS` with the surface's normals, (n, 6); (n // 4, 6) if sparse."""
     assert truth.mesh is not None
     if kind == "random":
@@ -79,10 +84,27 @@ def draw_input(truth: Truth, kind: str, n: int, rng: np.random.Generator) -> np.
         idx = nonuniform_points(places, n, strength=STRENGTH, centers=CENTERS, generator=draws)
         drawn: np.ndarray = dense[idx[0].numpy()]
         return drawn
-    cloud = sample_poisson_disk(truth.mesh, n // 4 if kind == "sparse" else n, rng)
+    cloud = drawn_points(truth, n // 4 if kind == "sparse" else n, inputs, rng)
     if kind.startswith("noise_"):
-        cloud[:, :3] += rng.normal(scale=float(kind.removeprefix("noise_")) / 100, size=(n, 3))
+        noise = rng.normal(scale=float(kind.removeprefix("noise_")) / 100, size=(n, 3))
+        cloud[:, :3] += noise if noise_limit is None else noise.clip(-noise_limit, noise_limit)
     return cloud
+
+
+def drawn_points(truth: Truth, n: int, inputs: str, rng: np.random.Generator) -> np.ndarray:
+    """n points of a true surface, (n, 6): evenly spread, random by area, or some of the truth's own samples.
+
+    ValueError for a subset of fewer points than n.
+    """
+    assert truth.mesh is not None
+    if inputs == "poisson":
+        return sample_poisson_disk(truth.mesh, n, rng)
+    if inputs == "random":
+        return sample_area(truth.mesh, n, rng)
+    if n > len(truth.samples):
+        raise ValueError(f"points={n}: a subset of the truth has at most its {len(truth.samples)} points")
+    chosen: np.ndarray = truth.samples[rng.choice(len(truth.samples), n, replace=False)]
+    return chosen
 
 
 def truth_of_mesh(shape: str, mesh: Mesh, count: int, seed: int, *, warn: Warn = print) -> Truth:
@@ -91,7 +113,7 @@ def truth_of_mesh(shape: str, mesh: Mesh, count: int, seed: int, *, warn: Warn =
         warn(f"{shape}: is not watertight ({holes} open edges); taken as an open surface")
     samples = sample_poisson_disk(mesh, count, generator(seed, shape, "truth"))
     frame, name = frame_of(samples, mesh)
-    return Truth(shape, moved_mesh(mesh, frame), moved(samples, frame), name)
+    return Truth(shape, moved_mesh(mesh, frame), moved(samples, frame), name, frame.scale.item())
 
 
 def pair_cases(
@@ -106,6 +128,9 @@ def pair_cases(
 ) -> Iterator[Case]:
     """Prepared pairs of a folder: clouds/NAME.xyz (or ply ...) and truth/NAME.ply, the true mesh in the same frame.
 
+    Or as the public ones lie: input_2048/NAME.xyz, gt_8192/NAME.xyz, and the meshes, for P2F, in meshes/ or
+    original_meshes/ there or beside the folder.
+
     truth/NAME_<count>.npy, where there is one, holds the evenly spread points of the truth, (count, 3 or 6); without a
     mesh it is the truth. Of several, that of `truth_points` is taken, or the largest. Both are brought to the truth's
     unit sphere if they are not in one.
@@ -115,9 +140,10 @@ def pair_cases(
     Raises:
         ValueError: cloud, mesh and samples are not in one frame, or two files have the same name.
     """
+    folders = pair_folders(root)
     paths = [path for path in pair_files(root) if shapes is None or path.stem in shapes]
-    for path, names in zip(paths, columns_of(paths, columns, f"{root}/clouds"), strict=True):
-        truth, frame = read_truth(Path(root) / "truth", path.stem, truth_points, seed, warn)
+    for path, names in zip(paths, columns_of(paths, columns, str(folders.inputs)), strict=True):
+        truth, frame = read_truth(folders, path.stem, truth_points, seed, warn)
         points, given, _, notes = read_cloud(path, normals=normals, columns=names)
         for note in notes:
             warn(f"{path}: {note}")
@@ -126,12 +152,18 @@ def pair_cases(
         yield Case("given", points, given, truth)
 
 
-def read_truth(folder: Path, shape: str, count: int, seed: int, warn: Warn) -> tuple[Truth, Frame]:
+def read_truth(folders: PairFolders, shape: str, count: int, seed: int, warn: Warn) -> tuple[Truth, Frame]:
     """The true surface of a shape in a folder of pairs: its mesh, or samples of it."""
-    meshes = [path for path in files_of(folder, MESH_SUFFIXES) if path.stem == shape]
-    samples = samples_path(folder, shape, count, warn)
+    folder = folders.meshes
+    meshes = [path for path in files_of(folder, MESH_SUFFIXES) if path.stem == shape] if folder else []
+    samples = folders.sample_file(shape, count, warn)
     if not meshes and samples is None:
-        raise ValueError(f"{folder}: expected {shape}.ply, the true mesh of clouds/{shape}, or {shape}_<count>.npy")
+        expected = f"{shape}.ply, the true mesh of clouds/{shape}, or {shape}_<count>.npy"
+        if folders.public:
+            expected = f"{shape}.xyz, the truth of {folders.inputs}/{shape}"
+        raise ValueError(f"{folders.samples}: expected {expected}")
+    if not meshes and folders.public:
+        warn(f"{shape}: has no mesh, so no P2F; expected it in {folders.inputs.parent}/meshes")
     if len(meshes) > 1:
         raise ValueError(f"{meshes[0]} and {meshes[1]}: expected one true mesh of {shape}; remove or rename the other")
     mesh = read_mesh(meshes[0]) if meshes else None
@@ -139,7 +171,7 @@ def read_truth(folder: Path, shape: str, count: int, seed: int, warn: Warn) -> t
         warn(f"{meshes[0]}: is not watertight ({holes} open edges); taken as an open surface")
     if samples is not None:
         cloud = read_cloud(samples)
-        if len(cloud.points) != named_count(samples):
+        if not folders.public and len(cloud.points) != named_count(samples):
             raise ValueError(f"{samples}: holds {len(cloud.points)} points, its name says another number; rename it")
         if mesh is not None:
             reconstruction.check_frame(cloud.points, mesh, name=str(samples), truth_name=str(meshes[0]))
@@ -148,25 +180,8 @@ def read_truth(folder: Path, shape: str, count: int, seed: int, warn: Warn) -> t
         assert mesh is not None
         even = sample_poisson_disk(mesh, count, generator(seed, shape, "truth"))
     frame, name = frame_of(even, mesh)
-    return Truth(shape, mesh and moved_mesh(mesh, frame), moved(even, frame), name), frame
-
-
-def samples_path(folder: Path, shape: str, count: int, warn: Warn) -> Path | None:
-    """The file of `count` samples of a shape, or of the most where there is none of so many; None without any."""
-    found = {named_count(path): path for path in files_of(folder, {".npy"}) if path.stem.rpartition("_")[0] == shape}
-    found.pop(None, None)
-    if not found:
-        return None
-    chosen = count if count in found else max(n for n in found if n is not None)
-    if chosen != count:
-        warn(f"{found[chosen]}: is compared with, since there is no {shape}_{count}.npy (truth_points={count})")
-    return found[chosen]
-
-
-def named_count(path: Path) -> int | None:
-    """The count in NAME_<count>.npy."""
-    digits = path.stem.rpartition("_")[2]
-    return int(digits) if digits.isdecimal() else None
+    scaled = mesh and moved_mesh(mesh, frame)
+    return Truth(shape, scaled, moved(even, frame), name, frame.scale.item()), frame
 
 
 def check_pair(points: np.ndarray, truth: Truth, path: Path) -> None:
@@ -176,22 +191,6 @@ def check_pair(points: np.ndarray, truth: Truth, path: Path) -> None:
         corners = truth.samples[:, None, :3] + 1e-3 * np.eye(3)
         mesh = Mesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
     reconstruction.check_frame(points, mesh, name=str(path), truth_name=f"the truth of {truth.shape}")
-
-
-def pair_files(root: str | Path) -> list[Path]:
-    """The input clouds of a folder of prepared pairs."""
-    clouds = files_of(Path(root) / "clouds", CLOUD_SUFFIXES)
-    if not clouds:
-        raise ValueError(f"{root}/clouds: expected clouds ({', '.join(sorted(CLOUD_SUFFIXES))}), found none")
-    for one, other in itertools.pairwise(sorted(clouds, key=lambda path: path.stem)):
-        if one.stem == other.stem:  # their rows would be taken for those of one cloud
-            raise ValueError(f"{one} and {other}: are both named {one.stem}; rename or remove one")
-    return clouds
-
-
-def is_pairs_folder(root: str | Path) -> bool:
-    """Whether a folder holds prepared pairs, in clouds/ and truth/."""
-    return (Path(root) / "clouds").is_dir() and (Path(root) / "truth").is_dir()
 
 
 def generator(seed: int, shape: str, what: str) -> np.random.Generator:

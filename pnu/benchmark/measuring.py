@@ -73,7 +73,7 @@ def measure(
     cloud: np.ndarray, truth: Truth, closest: ClosestPoints = closest_points, metrics: Sequence[Metric] = METRICS
 ) -> dict[str, float]:
     """All metrics of a cloud (m, 3 or 6) by name; those that the truth cannot tell are left out."""
-    found = measured(Pair(cloud, truth.samples, truth.mesh, closest=closest), metrics)
+    found = measured(Pair(cloud, truth.samples, truth.mesh, closest=closest, unit=truth.unit), metrics)
     return {name: float(value) for name, value in found.items()}
 
 

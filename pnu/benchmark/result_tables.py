@@ -17,18 +17,18 @@ COSTS = (
     Shown("peak_memory_mb", "memory (MiB)", "MiB", unit="MiB", form=".0f"),
 )
 LEGEND = (
-    "CD: mean squared distances, both directions added; HD: largest squared distance; P2F: mean distance to the true "
-    "mesh; all three x 1e3, in the {frame}. Normals: mean angle in degrees, signed (0..180) and unsigned (0..90); "
+    "{words}; all three x 1e3, in the {frame}. Normals: mean angle in degrees, signed (0..180) and unsigned (0..90); "
     "flipped: % of them. spacing: std/mean of the nearest distance; uniform.: spread of the density over disks of 1 % "
     "of the surface. floor: another Poisson-disk sampling of the true surface, as dense as the output."
 )
 REFERENCES = ("floor", "input")
 
 
-def legend(rows: Iterable[Row]) -> str:
+def legend(rows: Iterable[Row], metrics: Sequence[Metric] = METRICS) -> str:
     """What the numbers mean, their units and frame."""
     frames = dict.fromkeys(row["frame"] for row in rows)
-    return LEGEND.format(frame=f"frame of the truth ({', or '.join(frames)})")
+    words = "; ".join(metric.words for metric in metrics if metric.words)
+    return LEGEND.format(words=words, frame=f"frame of the truth ({', or '.join(frames)})")
 
 
 def columns(rows: Iterable[Row], metrics: Sequence[Metric] = METRICS) -> list[Shown]:
@@ -83,7 +83,7 @@ def print_tables(rows: Sequence[Row], head: str, metrics: Sequence[Metric] = MET
                 "", "spread", *(row_cell(spread, shown) for shown in all_shown), style="dim", end_section=True
             )
         console.print(table)
-    console.print(f"{head}. {legend(rows)}\n")
+    console.print(f"{head}. {legend(rows, metrics)}\n")
 
 
 def counts(rows: Sequence[Row]) -> str:
@@ -111,7 +111,7 @@ def write_results(
     content = {
         **head,
         **used_points(rows),
-        "legend": legend(rows),
+        "legend": legend(rows, metrics),
         "rows": list(rows),
         "summary": summarize(rows, metrics),
     }

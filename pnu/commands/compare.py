@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pnu.commands._entry import command, warn
+from pnu.commands._protocol import protocol_source
 from pnu.config.instantiate import find_metric
 from pnu.config.quoting import quoted, typed_line
 from pnu.config.schema import Group, doc
@@ -26,15 +27,17 @@ class Compare:
         "run folders, folders of a sweep, and apss, poisson, midpoint; NAME:FOLDER gives a run another name"
     )
     data: Group = doc(
-        "Shapes: procedural, or of data=meshes data.root=FOLDER, meshes or prepared pairs in clouds/ and truth/"
+        "Shapes: procedural, or of data=meshes data.root=FOLDER: meshes, pairs in clouds/ truth/ or input_N/ gt_N/"
     )
     part: str | None = doc("of the shapes: train, val, test, all; null: test of the procedural ones, all of a folder")
     shapes: list[str] | None = doc("names of the shapes to take; null: all of the part")
-    kinds: list[str] = doc(
-        "of input: uniform, random, nonuniform, sparse (a quarter of the points), noise_0.5, noise_1"
+    protocol: Group = doc("Protocol: sampling, frame, definitions")
+    kinds: list[str] | None = doc(
+        "of input: uniform, random, nonuniform, sparse (a quarter of the points), noise_0.5, noise_1, noise_2; "
+        "null: the protocol's"
     )
-    points: int = doc("points of an input cloud")
-    truth_points: int = doc("points on the true surface to compare with")
+    points: int | None = doc("points of an input cloud; null: the protocol's")
+    truth_points: int | None = doc("points on the true surface to compare with; null: the protocol's")
     columns: str | None = doc(
         "of prepared pairs' text, or arrays without names: x,y,z,_,nx,ny,nz; null: by their names or the usual order"
     )
@@ -65,11 +68,8 @@ def compare(cfg: Any) -> None:
     from pnu.report import comparison_page
     from pnu.training.run_folder import versions
 
-    chosen = metrics.with_own(cfg.metrics, functools.partial(find_metric, allow=cfg.allow))
-    source = benchmark.case_source(
-        cfg.data, cfg.kinds, part=cfg.part, only=cfg.shapes, points=cfg.points, truth_points=cfg.truth_points,
-        seed=cfg.seed, normals=cfg.normals == "given", columns=cfg.columns, warn=warn,
-    )  # fmt: skip
+    protocol, source = protocol_source(cfg)
+    chosen = protocol.metrics(metrics.with_own(cfg.metrics, functools.partial(find_metric, allow=cfg.allow)))
     rebuilt_kinds = source.kinds[:1] if cfg.surfaces is None else list(cfg.surfaces)
     if unknown := [kind for kind in rebuilt_kinds if kind not in source.kinds]:
         raise ValueError(f"surfaces={unknown[0]}: expected some of the kinds of input, {', '.join(source.kinds)}")
@@ -90,15 +90,22 @@ def compare(cfg: Any) -> None:
         rows = list(benchmark.evaluate(methods, source.cases, **options))
     if not cfg.quiet:
         benchmark.print_tables(rows, f"{', '.join(methods)} on {source.name}", chosen)
+        benchmark.print_published(protocol.published_rows(cfg.ratio))
     with steps(len(shown), cfg.quiet) as step:
         written = comparison_page.write_comparison(
             output,
             rows,
             list(shown.values()),
             title=f"Point cloud upsampling, {cfg.ratio:g} times: {', '.join(methods)}",
-            head=[benchmark.legend(rows), *seen, f"Made by: {typed_line()}", provenance([1])],
+            head=[benchmark.legend(rows, chosen), *seen, f"Made by: {typed_line()}", provenance([1])],
             settings={key: cfg[key] for key in SETTINGS}
-            | {"data": source.name, "versions": versions(), "made": provenance([1])},
+            | {
+                "kinds": source.kinds,
+                "protocol": protocol.said,
+                "data": source.name,
+                "versions": versions(),
+                "made": provenance([1]),
+            },
             rebuilt_kinds=rebuilt_kinds,
             look=comparison_page.Look(cfg.up, cfg.azimuth, cfg.elevation, cfg.size, cfg.colormap),
             page_mb=cfg.page_mb,
@@ -113,7 +120,7 @@ def compare(cfg: Any) -> None:
         print(f"next:   open {output}/index.html in a browser")
 
 
-SETTINGS = ("methods", "kinds", "points", "truth_points", "ratio", "normals", "seed")
+SETTINGS = ("methods", "points", "truth_points", "ratio", "normals", "seed")
 
 
 def upsamplers(cfg: Any) -> dict[str, "Method"]:

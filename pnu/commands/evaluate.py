@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pnu.commands._entry import command, warn
+from pnu.commands._entry import command
+from pnu.commands._protocol import protocol_source
 from pnu.config.instantiate import find_metric
 from pnu.config.quoting import shell_line
 from pnu.config.schema import Group, doc
@@ -28,15 +29,17 @@ class Evaluate:
     )
     method: str | None = doc("upsampler without training instead of a run: apss, poisson or midpoint")
     data: Group = doc(
-        "Shapes: procedural, or of data=meshes data.root=FOLDER, meshes or prepared pairs in clouds/ and truth/"
+        "Shapes: procedural, or of data=meshes data.root=FOLDER: meshes, pairs in clouds/ truth/ or input_N/ gt_N/"
     )
     part: str | None = doc("of the shapes: train, val, test, all; null: test of the procedural ones, all of a folder")
     shapes: list[str] | None = doc("names of the shapes to take; null: all of the part")
-    kinds: list[str] = doc(
-        "of input: uniform, random, nonuniform, sparse (a quarter of the points), noise_0.5, noise_1"
+    protocol: Group = doc("Protocol: sampling, frame, definitions")
+    kinds: list[str] | None = doc(
+        "of input: uniform, random, nonuniform, sparse (a quarter of the points), noise_0.5, noise_1, noise_2; "
+        "null: the protocol's"
     )
-    points: int = doc("points of an input cloud")
-    truth_points: int = doc("points on the true surface to compare with")
+    points: int | None = doc("points of an input cloud; null: the protocol's")
+    truth_points: int | None = doc("points on the true surface to compare with; null: the protocol's")
     columns: str | None = doc(
         "of prepared pairs' text, or arrays without names: x,y,z,_,nx,ny,nz; null: by their names or the usual order"
     )
@@ -65,11 +68,8 @@ def evaluate(cfg: Any) -> None:
     from pnu.training.run_folder import run_name
     from pnu.upsamplers import classical
 
-    chosen = metrics.with_own(cfg.metrics, functools.partial(find_metric, allow=cfg.allow))
-    source = benchmark.case_source(
-        cfg.data, cfg.kinds, part=cfg.part, only=cfg.shapes, points=cfg.points, truth_points=cfg.truth_points,
-        seed=cfg.seed, normals=cfg.normals == "given", columns=cfg.columns, warn=warn,
-    )  # fmt: skip
+    protocol, source = protocol_source(cfg)
+    chosen = protocol.metrics(metrics.with_own(cfg.metrics, functools.partial(find_metric, allow=cfg.allow)))
     subject = cfg.method or str(checkpoints.resolve(cfg.run or DEFAULT[cfg.normals]))
     model = classical(subject) if cfg.method else checkpoints.load(subject, cfg.allow)
     upsampler = benchmark.network_upsampler(
@@ -102,10 +102,16 @@ def evaluate(cfg: Any) -> None:
             )
         )
     made = provenance([1])
-    head = {key: cfg[key] for key in SETTINGS} | {"subject": subject, "data": source.name, "made": made}
+    head = {key: cfg[key] for key in SETTINGS} | {
+        "protocol": protocol.said,
+        "subject": subject,
+        "data": source.name,
+        "made": made,
+    }
     benchmark.write_results(output, rows, head, chosen)
     if not cfg.quiet:
         benchmark.print_tables(rows, f"{subject}, normals of the input {NORMALS[cfg.normals]}. {made}", chosen)
+        benchmark.print_published(protocol.published_rows(cfg.ratio))
         print(f"output: {output}/metrics.json, metrics.csv{', clouds/' if cfg.save else ''}")
         data = {"data": "meshes", "data.root": cfg.data.root} if cfg.data.get("root") else {}
         data |= {"columns": cfg.columns} if cfg.columns else {}

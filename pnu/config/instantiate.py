@@ -9,6 +9,7 @@ PACKAGES = {  # which may define the classes of a group; `allow` adds to them
     "data": ("pnu.data",),
     "model": ("pnu.networks",),
     "loss": ("pnu.losses",),
+    "protocol": ("pnu.benchmark",),
     "optimizer": ("torch.optim",),
     "scheduler": ("torch.optim.lr_scheduler",),
     "trainer": ("lightning.pytorch",),

@@ -64,9 +64,10 @@ class Metric:
     2.0
     """
 
-    shown: ClassVar[Shown]
+    shown: Shown
     needs: ClassVar[Sequence[str]] = ("target",)
     patches: ClassVar[bool] = True
+    words: str = ""  # for the legend of a table
 
     def __call__(self, pair: Pair) -> Tensor:
         """Values (B,) of a batch of clouds."""
@@ -77,6 +78,7 @@ class ChamferSq(Metric):
     """Chamfer distance: mean squared nearest distances, both ways added."""
 
     shown = Shown("chamfer_sq", "CD x 1e3", "CD", 1e3, "length squared", ".4f")
+    words = "CD: mean squared distances, both directions added"
 
     def __call__(self, pair: Pair) -> Tensor:
         return functional.chamfer_sq(pair)
@@ -86,6 +88,7 @@ class HausdorffSq(Metric):
     """Hausdorff distance, squared: the larger of both maxima."""
 
     shown = Shown("hausdorff_sq", "HD (squared) x 1e3", "HD", 1e3, "length squared")
+    words = "HD: largest squared distance"
 
     def __call__(self, pair: Pair) -> Tensor:
         return functional.hausdorff_sq(pair)
@@ -95,6 +98,7 @@ class P2F(Metric):
     """Mean distance to the true mesh."""
 
     shown = Shown("p2f", "P2F x 1e3", "P2F", 1e3, "length")
+    words = "P2F: mean distance to the true mesh"
     needs = ("mesh",)
 
     def __call__(self, pair: Pair) -> Tensor:

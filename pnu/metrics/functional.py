@@ -49,6 +49,7 @@ class Pair:
         target: points of the truth, (m, C), (1, m, C) or (B, m, C), or None.
         mesh: of the truth, or None; its normals count, not those of the nearest target point.
         closest: search for the closest points of the mesh.
+        unit: length of the clouds' unit in that of the file that the mesh came from.
     """
 
     def __init__(
@@ -58,13 +59,15 @@ class Pair:
         mesh: Mesh | None = None,
         *,
         closest: ClosestPoints = closest_points,
+        unit: float = 1.0,
     ) -> None:
         self.target: Tensor | None = None
         if target is None:
             self.prediction, self.one = _clouds(prediction, "prediction")
         else:
             self.prediction, self.target, self.one = _pair(prediction, target)
-        self.mesh, self.closest = mesh, closest
+        self.mesh, self.closest, self.unit = mesh, closest, unit
+        self.each: Pair | None = None  # both clouds in unit spheres of their own, once something asked for them
 
     @property
     def has(self) -> set[str]:

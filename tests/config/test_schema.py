@@ -18,7 +18,7 @@ from pnu.config.help_text import help_text, reference, written
 from pnu.config.schema import as_type, class_arguments, library, settable, targets, type_name
 from pnu.config.signature import REQUIRED, Class, arguments, described, summary
 
-GROUPS = ("callbacks", "data", "logger", "loss", "model", "optimizer", "scheduler", "trainer")
+GROUPS = ("callbacks", "data", "logger", "loss", "model", "optimizer", "protocol", "scheduler", "trainer")
 CLASSES = sorted(
     {(group, target) for group in GROUPS for named in targets(group).values() for target in named.values()}
 )
