@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from typing import Any, Literal
 
 from pnu.data import shapes
-from pnu.data.crops import SMALLEST, Crops, WholeClouds, flattened, stacked_items
+from pnu.data.crops import LEAST, SMALLEST, Crops, WholeClouds, flattened, stacked_items
 from pnu.data.mesh_scene import MeshScene
 from pnu.data.patch_module import EpochDataModule, say_open
 from pnu.geometry.mesh_topology import open_edges
@@ -20,6 +20,8 @@ class ProjectionDataModule(EpochDataModule):
         validation: names of the meshes kept for validation and test
         normals: of the input: given, estimated from its points, or mixed
         scans: share of the clouds that are simulated scans
+        blue: share of the other clouds whose points keep a distance, as blue noise
+        least: points of the smallest clouds
         clouds: of an epoch, each drawn anew
         size: points of a crop
         views: crops of a cloud
@@ -34,16 +36,16 @@ class ProjectionDataModule(EpochDataModule):
 
     def __init__(
         self, root: str | None = None, procedural: bool = True, validation: Iterable[str] = (),
-        normals: Literal["given", "estimated", "mixed"] = "given", scans: float = 0.0,
-        clouds: int = 6400, size: int = 384, views: int = 2, batch_size: int = 8, points: int = 2048,
-        workers: int = 0, seed: int = 0,
+        normals: Literal["given", "estimated", "mixed"] = "given",
+        scans: float = 0.0, blue: float = 0.15, least: int = LEAST, clouds: int = 6400, size: int = 384, views: int = 2,
+        batch_size: int = 8, points: int = 2048, workers: int = 0, seed: int = 0,
     ) -> None:  # fmt: skip
         super().__init__(batch_size, workers, seed)
         if points < SMALLEST:
             raise ValueError(f"data.points={points}: expected at least {SMALLEST}")
         self.evaluation_batch_size = 1
         self.root, self.procedural, self.held_out = root, procedural, list(validation)
-        self.scans = scans
+        self.scans, self.blue, self.least = scans, blue, least
         self.normals, self.clouds, self.size, self.views, self.points = normals, clouds, size, views, points
         self.truth: MeshScene | None = None
 
@@ -76,6 +78,8 @@ class ProjectionDataModule(EpochDataModule):
             views=self.views,
             normals=self.normals,
             scans=self.scans,
+            blue=self.blue,
+            least=self.least,
             seed=self.seed,
         )
         clouds = {

@@ -15,19 +15,20 @@ from pnu.geometry.normal_estimation import estimate_normals, refit_normals
 from pnu.geometry.sampling import farthest_points_large
 from pnu.io import Mesh
 
-SIZES = (600, 8000)  # points of a cloud, evenly spread in the logarithm, for half of the clouds
+LEAST, MOST = 600, 8000  # points of a cloud, evenly spread in the logarithm, for half of the clouds
 USUAL = (1500, 6500)  # and for the other half
 SMALLEST = 16  # points of a crop, or of a cloud for validation, from which surfaces can be told
 MARGIN = 32  # points beyond a crop that its estimated normals need
 TAKEN = 0.015  # distance from the surface up to which a point of a scan is taken for a measurement of it,
 OVERLOOKED = 0.03  # and the share of the others that stay, as where they are removed by their looks
 GIVEN = 0.3  # share of the crops that have true normals where normals="mixed"
+UNEVEN = 0.2  # share of the clouds
 
 
 class Crops(Dataset[dict[str, Any]]):
     """`length` random clouds, each in `views` crops: the `size` points around one of its points, nearest first.
 
-    A cloud has 600 to 8000 points, drawn evenly (65 %), unevenly (20 %) or as blue noise (15 %). With
+    A cloud has `least` to 8000 points, drawn at random, unevenly (20 %), or as blue noise (a share `blue`). With
     normals="given" they are true, in 15 % of the clouds a little off, and 20 % of the clouds have up to 1 % noise; with
     "estimated" they come from the cloud, with the true side, and half of the clouds have up to 2 % noise
     (Gaussian, standard deviation in units of the shape's radius); "mixed": estimated in 70 % of the crops. Inside and
@@ -41,20 +42,24 @@ class Crops(Dataset[dict[str, Any]]):
 
     def __init__(
         self, meshes: dict[str, Mesh], length: int, *, size: int = 384, views: int = 2, normals: str = "given",
-        scans: float = 0.0, seed: int = 0,
+        scans: float = 0.0, blue: float = 0.15, least: int = LEAST, seed: int = 0,
     ) -> None:  # fmt: skip
         if normals not in ("given", "estimated", "mixed"):
             raise ValueError(f"data.normals={normals}: expected given, estimated or mixed")
         if not 0 <= scans <= 1:
             raise ValueError(f"data.scans={scans}: expected a share from 0 to 1")
-        if not SMALLEST <= size <= SIZES[0]:
+        if not 0 <= blue <= 1 - UNEVEN:
+            raise ValueError(f"data.blue={blue}: expected a share from 0 to {1 - UNEVEN}; {UNEVEN} are uneven")
+        if not SMALLEST <= least <= USUAL[0]:
+            raise ValueError(f"data.least={least}: expected {SMALLEST} to {USUAL[0]} points")
+        if not SMALLEST <= size <= least:
             raise ValueError(
-                f"data.size={size}: expected {SMALLEST} to {SIZES[0]}, the points of the smallest clouds that are drawn"
+                f"data.size={size}: expected {SMALLEST} to {least}, the points of the smallest clouds that are drawn"
             )
         if length < 1 or views < 1:
             raise ValueError(f"data: expected clouds >= 1 and views >= 1, found {length} and {views}")
         self.names, self.meshes = list(meshes), list(meshes.values())
-        self.length, self.size, self.views = length, size, views
+        self.length, self.size, self.views, self.blue, self.least = length, size, views, blue, least
         self.estimated, self.mixed, self.scans, self.seed = normals != "given", normals == "mixed", scans, seed
         self.scanners = [Scanner(mesh) for mesh in self.meshes]
 
@@ -114,17 +119,20 @@ class Crops(Dataset[dict[str, Any]]):
             rows = thinned_lines(points)
             if rows is not None:
                 points, clean = averaged(points, rows), clean[rows]
-            if len(points) >= SIZES[0] + MARGIN:
+            if len(points) >= self.least + MARGIN:
                 return clean, np.hstack([points, clean[:, 3:]])
 
     def cloud(self, mesh: Mesh, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """A cloud (n, 6) with true normals, and the same with the noise of an input."""
-        low, high = SIZES
-        n = round(np.exp(rng.uniform(np.log(low), np.log(high)))) if rng.random() < 0.5 else int(rng.integers(*USUAL))
+        n = (
+            round(np.exp(rng.uniform(np.log(self.least), np.log(MOST))))
+            if rng.random() < 0.5
+            else int(rng.integers(*USUAL))
+        )
         kind = rng.random()
-        if kind < 0.65:
+        if kind < 1 - UNEVEN - self.blue:
             clean = sample_area(mesh, n, rng)
-        elif kind < 0.8:
+        elif kind < 1 - UNEVEN:
             dense = sample_area(mesh, 4 * n, rng)
             clean = dense[farthest_points_large(dense[:, :3], n)]
         else:
