@@ -248,7 +248,8 @@ def test_tables_of_measurements_say_how_they_were_made(page: str) -> None:
     assert not unexplained(text(page))
 
 
-@pytest.mark.parametrize("own", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("own", [False, True])
 def test_example_goes_from_scan_to_mesh(own: bool, tmp_path: Path) -> None:
     given = []
     if own:

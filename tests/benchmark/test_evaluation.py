@@ -435,6 +435,7 @@ def test_command_with_a_run(place: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert sorted(path.name for path in folder.iterdir()) == ["clouds", "metrics.csv", "metrics.json"]
 
 
+@pytest.mark.slow
 def test_command_with_a_method_twice_is_the_same(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     results = []
     for folder in ("one", "two"):
@@ -508,6 +509,7 @@ def test_command_as_users_start_it(place: Path) -> None:
     assert done.stderr == "error: method=nearest: expected one of apss, poisson, midpoint\n"
 
 
+@pytest.mark.slow
 def test_equal_to_the_public_score_script(shared: Path, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("open3d")
     spec = importlib.util.spec_from_file_location("score", shared / "bench" / "score.py")

@@ -131,6 +131,7 @@ def test_columns_of_pairs_as_text(place: Path, tmp_path: Path) -> None:
     assert [row["p2f"] < 0.01 for row in rows if row["method"] == "midpoint"] == [True]
 
 
+@pytest.mark.slow
 def test_a_network_of_a_run_folder(place: Path) -> None:
     data = ["data=meshes", f"data.root={place}/meshes", "kinds=[uniform]", "surfaces=[]", "shapes=[ball]"]
     main([f"methods=[{place}/runs/first,ours:{place}/runs/first]", *data, *SMALL, f"output={place}/network"])

@@ -289,6 +289,7 @@ def test_what_a_las_says_is_enough_for_upsample(place: Path, capsys: pytest.Capt
 
 
 @pytest.mark.skipif(bool(open3d_error()), reason="open3d's system libraries are missing")
+@pytest.mark.slow
 def test_reconstruct_and_scan_take_the_same_keys(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     keys = ("output=mesh.ply", "depth=5")
     line = notes(capsys, "reconstruct", "input=mixed.ply", *keys)

@@ -11,8 +11,10 @@ import pytest
 import torch
 import yaml
 
+from pnu.commands.upsample import main
 from pnu.io import read_cloud, write_cloud, write_json
 from pnu.networks.pnu import PNU
+from tests.refusals import ran
 
 MODEL = {"_target_": "pnu.networks.pnu.PNU", "ratio": 2, "local_features": False}
 
@@ -40,8 +42,7 @@ def place(tmp_path: Path) -> Path:
 
 
 def upsample(place: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "pnu", "upsample", *arguments]
-    return subprocess.run(command, cwd=place, capture_output=True, text=True, check=False, timeout=120)
+    return ran(main, place, *arguments)
 
 
 def test_newest_run_and_report(place: Path) -> None:

@@ -215,6 +215,7 @@ def trained(say: Say, training: tuple[Path, str]) -> str:
     return text
 
 
+@pytest.mark.slow
 def test_from_patches_to_a_picture(say: Say, trained: str) -> None:
     dense = say(printed(trained), override("output", in_nasty("dense.ply")), "ratio=2")
     assert len(read_cloud(in_nasty("dense.ply")).points) == 600
@@ -252,6 +253,7 @@ def test_weights_of_the_released_code(say: Say) -> None:
     assert len(read_cloud("dense.ply").points) == 600
 
 
+@pytest.mark.slow
 def test_an_evaluation_then_a_comparison(say: Say, trained: str) -> None:
     Path(in_nasty("meshes")).mkdir()
     write_mesh(in_nasty("meshes/mug.ply"), shapes.make("mug"))
@@ -282,6 +284,7 @@ def test_a_run_that_was_stopped(say: Say, trained: str, capsys: pytest.CaptureFi
     assert run.read_record()["status"] == "finished"
 
 
+@pytest.mark.slow
 def test_a_finished_run_that_lost_its_last_checkpoint(
     say: Say, trained: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -65,6 +65,7 @@ def test_file_has_the_documented_datasets(file: Path) -> None:
     assert contents.parameters == {"source": "test"}
 
 
+@pytest.mark.slow
 def test_same_patches_with_two_processes(file: Path, tmp_path: Path) -> None:
     cut_patch_file(tmp_path / "again.h5", MAKERS, 5, processes=2)
     with h5py.File(file) as one, h5py.File(tmp_path / "again.h5") as two:

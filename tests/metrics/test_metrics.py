@@ -257,6 +257,7 @@ def _rank(rank: int, folder: str) -> None:
     torch.distributed.destroy_process_group()
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_result_of_one(tmp_path: Path) -> None:
     torch.multiprocessing.spawn(_rank, args=(str(tmp_path),), nprocs=2)
     for rank in range(2):
@@ -265,7 +266,13 @@ def test_two_processes_give_the_result_of_one(tmp_path: Path) -> None:
             np.testing.assert_allclose(found[name], feed(make(), batches()), rtol=1e-5, err_msg=name)
 
 
-@pytest.mark.parametrize("shape", ["casting", "duck", "fandisk", "camel", "elephant", "kitten"])
+@pytest.mark.parametrize(
+    "shape",
+    [
+        "duck",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("casting", "fandisk", "camel", "elephant", "kitten")),
+    ],
+)
 def test_equal_to_the_public_score_script(shared: Path, shape: str) -> None:
     pytest.importorskip("open3d")
     spec = importlib.util.spec_from_file_location("score", shared / "bench" / "score.py")

@@ -273,6 +273,7 @@ def swept(patch_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:  
     return folder / "outputs" / "sweeps" / "s"
 
 
+@pytest.mark.slow
 def test_report_of_a_real_sweep(swept: Path) -> None:
     folder = swept / "report"
     names = {path.name for path in folder.iterdir()}

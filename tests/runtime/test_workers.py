@@ -61,6 +61,7 @@ def test_order_errors_and_end() -> None:
 
 @pytest.mark.parametrize("devices", [2, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("model", ["surface", pytest.param("patches", marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_the_number_of_devices_does_not_matter(model: str, devices: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(surface_projection, "BATCHES", 1)  # many parts
     monkeypatch.setattr(procedure, "BATCHES", 2)

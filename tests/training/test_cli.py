@@ -171,6 +171,7 @@ def test_one_line_trains(tmp_path: Path, small: list[str]) -> None:
     assert read_checkpoint(run / "checkpoints/last.ckpt")["global_step"] == 20
 
 
+@pytest.mark.slow
 def test_a_multirun_leaves_a_complete_folder_for_each_value(tmp_path: Path, small: list[str]) -> None:
     done = train(tmp_path, *small, "-m", "loss.w3=0,0.05", "trainer.max_steps=5", "quiet=true")
     assert (done.returncode, done.stderr) == (0, "")
@@ -187,6 +188,7 @@ def test_a_multirun_leaves_a_complete_folder_for_each_value(tmp_path: Path, smal
 
 
 @pytest.mark.usefixtures("untraced")
+@pytest.mark.slow
 def test_a_failed_job_leaves_the_others_and_a_record(tmp_path: Path, small: list[str]) -> None:
     done = train(tmp_path, *small, "-m", "model.ratio=3,4", "trainer.max_steps=1", "quiet=true")
     assert done.returncode != 0
@@ -196,6 +198,7 @@ def test_a_failed_job_leaves_the_others_and_a_record(tmp_path: Path, small: list
     assert "model.ratio" in next(record["error"] for record in records if record["status"] == "failed")
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_as_if_never_stopped(tmp_path: Path, small: list[str]) -> None:
     options = [*small, "callbacks.checkpoints.every_n_steps=1", "trainer.max_epochs=6", "quiet=true"]
     options += ["model.local_features=false"]
@@ -219,6 +222,7 @@ def test_killed_and_resumed_as_if_never_stopped(tmp_path: Path, small: list[str]
 
 
 @pytest.mark.usefixtures("untraced")
+@pytest.mark.slow
 def test_interrupted_by_hand(tmp_path: Path, small: list[str]) -> None:
     """Ctrl-C: the record says so, and the last line how to go on."""
     process = start(tmp_path, *small, "callbacks.checkpoints.every_n_steps=1", f"run={tmp_path / 'run'}")

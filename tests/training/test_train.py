@@ -297,7 +297,10 @@ def test_same_seed_same_weights_whatever_the_workers(train: Train) -> None:
     "options",
     [
         pytest.param(["trainer.max_epochs=2", "scheduler=onecycle"], marks=pytest.mark.slow),
-        ["trainer.max_steps=6", "trainer.check_val_every_n_epoch=null", "trainer.val_check_interval=3"],
+        pytest.param(
+            ["trainer.max_steps=6", "trainer.check_val_every_n_epoch=null", "trainer.val_check_interval=3"],
+            marks=pytest.mark.slow,
+        ),
         pytest.param(["trainer.max_epochs=2", "trainer.accumulate_grad_batches=2"], marks=pytest.mark.slow),
     ],
 )
@@ -341,7 +344,14 @@ def test_a_finished_run_can_be_made_longer(train: Train) -> None:
     assert yaml.safe_load((run / "config.yaml").read_text())["trainer"]["max_epochs"] == 2
 
 
-@pytest.mark.parametrize(("steps", "more"), [(2, []), (4, []), (1, ["trainer.accumulate_grad_batches=3"])])
+@pytest.mark.parametrize(
+    ("steps", "more"),
+    [
+        (4, []),
+        pytest.param(2, [], marks=pytest.mark.slow),
+        pytest.param(1, ["trainer.accumulate_grad_batches=3"], marks=pytest.mark.slow),
+    ],
+)
 def test_a_run_that_ended_within_an_epoch_can_be_made_longer(train: Train, steps: int, more: list[str]) -> None:
     """It goes on with the rest of the epoch, or with the next, as a run that never ended."""
     options = ["model.local_features=false", "trainer.max_epochs=9", *more]
@@ -548,6 +558,7 @@ def test_early_stopping_stops(train: Train) -> None:
     assert read_checkpoint(run / "checkpoints/last.ckpt")["global_step"] < 36
 
 
+@pytest.mark.slow
 def test_deterministic_mode_gives_the_same_bits(train: Train) -> None:
     try:
         one, two = (weights(train("trainer.deterministic=true", "trainer.max_steps=2", run=name)) for name in "ab")
