@@ -12,11 +12,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import open3d
 import torch
-from scipy.spatial import cKDTree
 
-from pnu.benchmark.cases import generator
+from pnu.benchmark.cases import generator, seen_samples
+from pnu.benchmark.open3d_chain import open3d_chain
 from pnu.data import shapes
 from pnu.data.mesh_scene import MeshScene
 from pnu.data.scanner import KINDS, Scanner, SimulatedScan
@@ -35,33 +34,13 @@ def pnu_as_it_is(scan: SimulatedScan) -> np.ndarray:
     return upsample(scan.points, scan.normals, outliers="keep", lines="keep", density="even", keep=False)
 
 
-def open3d_chain(scan: SimulatedScan) -> np.ndarray:
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(scan.points))
-    cloud, rows = cloud.remove_statistical_outlier(16, 2.0)
-    if scan.normals is None:
-        cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(16))
-        cloud.orient_normals_consistent_tangent_plane(16)
-    else:
-        cloud.normals = open3d.utility.Vector3dVector(scan.normals[rows])
-    mesh, density = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=8, n_threads=1)
-    mesh.remove_vertices_by_mask(np.asarray(density) < np.quantile(np.asarray(density), 0.03))
-    open3d.utility.random.seed(0)
-    dense = mesh.sample_points_poisson_disk(4 * len(scan.points), 2)
-    return np.hstack([np.asarray(dense.points), np.asarray(dense.normals)])
+def open3d_default(scan: SimulatedScan) -> np.ndarray:
+    return open3d_chain(4)(scan.points, scan.normals)
 
 
 METHODS: dict[str, Callable[[SimulatedScan], np.ndarray]] = {
-    "pnu": pnu_default, "pnu, as it is": pnu_as_it_is, "open3d": open3d_chain,
+    "pnu": pnu_default, "pnu, as it is": pnu_as_it_is, "open3d": open3d_default,
 }  # fmt: skip
-
-
-def seen_points(scan: SimulatedScan, truth: np.ndarray, kind: str) -> np.ndarray:
-    """Those of the points of the true surface that lie where the scan has points."""
-    there = scan.clean[np.isfinite(scan.clean[:, 0]), :3]
-    tree = cKDTree(there)
-    reach = 0.06 if kind == "lines" else 3 * np.median(tree.query(there, 4)[0][:, 3])
-    found: np.ndarray = truth[tree.query(truth)[0] < reach]
-    return found
 
 
 def main() -> None:
@@ -80,7 +59,7 @@ def main() -> None:
         truth = sample_poisson_disk(mesh, 10000, np.random.default_rng(0))[:, :3]
         for kind in arguments.kinds:
             scan = KINDS[kind](scanner, generator(arguments.seed, name, kind))
-            seen = seen_points(scan, truth, kind)
+            seen = seen_samples(truth, scan, kind)
             for method in arguments.methods:
                 started = time.perf_counter()
                 dense = METHODS[method](scan)

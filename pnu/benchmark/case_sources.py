@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pnu.benchmark.cases import KINDS, Case, mesh_cases, pair_cases
+from pnu.benchmark.cases import KINDS, SCANS, Case, mesh_cases, pair_cases
 from pnu.benchmark.pair_folders import Warn, is_pairs_folder, pair_files, pair_folders
 from pnu.data import shapes
 from pnu.data.patch_dataset import split_shapes
@@ -44,7 +44,7 @@ def case_source(
     Args:
         data: a choice of conf/data: with `root` a folder of meshes, or of prepared pairs in clouds/ and truth/ (whose
             clouds are the inputs, whatever `kinds`); with `kinds` the procedural shapes.
-        kinds: of input, some of `KINDS`.
+        kinds: of input, some of `KINDS` and `SCANS`.
         part: of the shapes, split as training splits them: train, val, test or all; default: test of the procedural
             shapes, all of a folder.
         only: names of shapes to take; default: all of the part.
@@ -55,8 +55,8 @@ def case_source(
         columns: of prepared clouds that are text or arrays without names, such as "x,y,z,_,nx,ny,nz".
         inputs: how they are drawn from meshes, noise_limit: greatest offset by noise; see `pnu.benchmark.Protocol`.
     """
-    if unknown := [kind for kind in kinds if kind not in KINDS]:
-        raise ValueError(f"kinds={unknown[0]}: expected some of {', '.join(KINDS)}")
+    if unknown := [kind for kind in kinds if kind not in (*KINDS, *SCANS)]:
+        raise ValueError(f"kinds={unknown[0]}: expected some of {', '.join((*KINDS, *SCANS))}")
     if part not in (None, *PARTS):
         raise ValueError(f"part={part}: expected one of {', '.join(PARTS)}")
     for name, value, least in (("points", points, 64), ("truth_points", truth_points, 150)):

@@ -7,9 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from pnu import reconstruction
 from pnu.benchmark.pair_folders import PairFolders, Warn, named_count, pair_files, pair_folders
+from pnu.data import scanner
 from pnu.geometry.mesh_sampling import face_areas, sample_area, sample_poisson_disk
 from pnu.geometry.mesh_topology import open_edges
 from pnu.geometry.sampling import nonuniform_points
@@ -21,6 +23,13 @@ KINDS = ("uniform", "random", "nonuniform", "sparse", "noise_0.5", "noise_1", "n
 """Kinds of input: evenly spread (Poisson-disk), random by area, denser around three places, evenly spread with a
 quarter of the points, evenly spread with Gaussian noise of 0.5 %, 1 % and 2 % of the radius in each coordinate.
 Evenly spread where the protocol says so: it may have them random, or a subset of the truth's."""
+
+SCANS = tuple(scanner.KINDS)
+"""Kinds that a simulated scanner gives (`pnu.data.scanner`), with as many points as it sees, and normals only where it
+knows some. They are compared with the part of the true surface that the scan has seen."""
+
+LINE = 0.06  # from scan lines, a tenth of whose points would do, the surface counts as seen that far,
+SEEN = 3.0  # and else so many spacings from the points
 
 STRENGTH, CENTERS, CANDIDATES = 2.0, 3, 4  # nonuniform: e^2 times denser, around 3 points, out of 4 times as many
 UNIT = 0.01  # how far a unit sphere's radius may be from 1, and its usual centers from the origin
@@ -65,9 +74,24 @@ def mesh_cases(
     """
     for shape, make in meshes.items():
         truth = truth_of_mesh(shape, make(), truth_points, seed, warn=warn)
+        scanned = scanner.Scanner(truth.mesh) if truth.mesh is not None and set(kinds) & set(SCANS) else None
         for kind in kinds:
+            if scanned is not None and kind in SCANS:
+                scan = scanner.KINDS[kind](scanned, generator(seed, shape, kind))
+                seen = truth._replace(samples=seen_samples(truth.samples, scan, kind))
+                yield Case(kind, scan.points, scan.normals if normals else None, seen)
+                continue
             cloud = draw_input(truth, kind, points, generator(seed, shape, kind), inputs, noise_limit)
             yield Case(kind, cloud[:, :3], cloud[:, 3:] if normals else None, truth)
+
+
+def seen_samples(samples: np.ndarray, scan: scanner.SimulatedScan, kind: str) -> np.ndarray:
+    """Those of the samples (m, 3 or 6) of a true surface that lie where a scan of one of `SCANS` has points."""
+    there = scan.clean[np.isfinite(scan.clean[:, 0]), :3]
+    tree = cKDTree(there)
+    reach = LINE if kind == "lines" else SEEN * float(np.median(tree.query(there, 4)[0][:, 3]))
+    found: np.ndarray = samples[tree.query(samples[:, :3])[0] < reach]
+    return found
 
 
 def draw_input(

@@ -8,12 +8,14 @@ import torch
 from torch import nn
 
 from pnu import upsamplers
-from pnu.benchmark.cases import Case, Truth, generator
+from pnu.benchmark.cases import SCANS, Case, Truth, generator
 from pnu.benchmark.cost import Cost
 from pnu.geometry.mesh_sampling import closest_points, sample_poisson_disk
 from pnu.geometry.normal_estimation import complete_normals
 from pnu.metrics import METRICS, Metric, Pair, measured
 from pnu.metrics.functional import ClosestPoints
+from pnu.metrics.scan_scores import SCAN_METRICS, SHARED
+from pnu.networks import checkpoints
 from pnu.upsamplers import whole_clouds
 
 Row = dict[str, Any]
@@ -38,13 +40,14 @@ def evaluate(
     """Rows for each case: every method, then two to judge them by.
 
     "input" is the input itself. "floor" is another Poisson-disk sampling of the true mesh with as many points as a
-    method gives: what perfect points on the true surface would score.
+    method gives: what perfect points on the true surface would score; simulated scans have none.
     `keep` gets every cloud; `step` is told what comes next.
     ValueError, naming method and shape, if a method gives another number of points than round(ratio n).
     """
+    chosen = {True: [m for m in metrics if is_of_scans(m)], False: [m for m in metrics if m not in SCAN_METRICS]}
     floors: dict[tuple[str, int], Row] = {}
     for case in cases:
-        truth = case.truth
+        truth, shown = case.truth, chosen[case.kind in SCANS]
         head = {"shape": truth.shape, "kind": case.kind, "frame": truth.frame, "truth_points": len(truth.samples)}
         wanted = round(ratio * len(case.points))
         for name, upsample in methods.items():
@@ -56,17 +59,27 @@ def evaluate(
             if keep:
                 keep(case, name, cloud)
             counts = {"method": name, "points_in": len(case.points), "points_out": wanted}
-            yield head | counts | measure(cloud, truth, closest, metrics) | cost.values
+            yield head | counts | measure(cloud, truth, closest, shown) | cost.values
         step(f"{truth.shape}, {case.kind}: references")
-        if truth.mesh is not None:
+        if truth.mesh is not None and case.kind not in SCANS:  # no perfect points would lie where nothing was seen
             key = truth.shape, wanted
             if key not in floors:
                 other = sample_poisson_disk(truth.mesh, wanted, generator(seed, truth.shape, f"floor {wanted}"))
-                floors[key] = measure(other, truth, closest, metrics)
+                floors[key] = measure(other, truth, closest, shown)
             yield head | {"method": "floor", "points_in": 0, "points_out": wanted} | floors[key]
         cloud = np.hstack([case.points, normals_of(case)])
         counts = {"method": "input", "points_in": len(cloud), "points_out": len(cloud)}
-        yield head | counts | measure(cloud, truth, closest, metrics)
+        yield head | counts | measure(cloud, truth, closest, shown)
+
+
+def is_of_scans(metric: Metric) -> bool:
+    """Whether a metric is measured of clouds made from scans: theirs, some of the usual ones, and one's own."""
+    return metric not in METRICS or isinstance(metric, SHARED)
+
+
+def of_kinds(kinds: Iterable[str]) -> tuple[Metric, ...]:
+    """The metrics to measure for inputs of these kinds: those of scans too, where there are some."""
+    return (*METRICS, *(SCAN_METRICS if set(kinds) & set(SCANS) else ()))
 
 
 def measure(
@@ -83,8 +96,18 @@ def normals_of(case: Case) -> np.ndarray:
     return complete_normals(torch.from_numpy(case.points), given).numpy()
 
 
+def measured_network(name: str, allow: Sequence[str] = ()) -> nn.Module | str:
+    """The network of a run folder or of weights; "surface" by its name, which means the weights that fit a cloud."""
+    return name if name == "surface" else checkpoints.load(name, allow)
+
+
 def network_upsampler(
-    model: nn.Module | upsamplers.Upsampler, ratio: float, *, passes: bool = False, name: str = "run", **options: Any
+    model: nn.Module | upsamplers.Upsampler | str,
+    ratio: float,
+    *,
+    passes: bool = False,
+    name: str = "run",
+    **options: Any,
 ) -> Method:
     """A network, or a classical method, as an upsampler: through `pnu.upsample`, as users call it.
 
@@ -93,7 +116,8 @@ def network_upsampler(
             passes or by leaving points out.
     """
     trained = getattr(model, "ratio", None)
-    if isinstance(upsamplers.upsampler_of(model), upsamplers.Patches) and trained != ratio and not passes:
+    patches = not isinstance(model, str) and isinstance(upsamplers.upsampler_of(model), upsamplers.Patches)
+    if patches and trained != ratio and not passes:
         raise ValueError(
             f"ratio={ratio:g}: {name} was trained for {trained}; give ratio={trained}, or passes=true to "
             f"reach {ratio:g} by passes and farthest points"

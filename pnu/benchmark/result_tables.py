@@ -17,7 +17,7 @@ COSTS = (
     Shown("peak_memory_mb", "memory (MiB)", "MiB", unit="MiB", form=".0f"),
 )
 LEGEND = (
-    "{words}; all three x 1e3, in the {frame}. Normals: mean angle in degrees, signed (0..180) and unsigned (0..90); "
+    "{words}; lengths x 1e3, in the {frame}. Normals: mean angle in degrees, signed (0..180) and unsigned (0..90); "
     "flipped: % of them. spacing: std/mean of the nearest distance; uniform.: spread of the density over disks of 1 % "
     "of the surface. floor: another Poisson-disk sampling of the true surface, as dense as the output."
 )
@@ -26,8 +26,10 @@ REFERENCES = ("floor", "input")
 
 def legend(rows: Iterable[Row], metrics: Sequence[Metric] = METRICS) -> str:
     """What the numbers mean, their units and frame."""
+    rows = list(rows)
     frames = dict.fromkeys(row["frame"] for row in rows)
-    words = "; ".join(metric.words for metric in metrics if metric.words)
+    names = {name for row in rows for name in row}
+    words = "; ".join(metric.words for metric in metrics if metric.words and metric.shown.name in names)
     return LEGEND.format(words=words, frame=f"frame of the truth ({', or '.join(frames)})")
 
 
@@ -63,9 +65,9 @@ def print_tables(rows: Sequence[Row], head: str, metrics: Sequence[Metric] = MET
 
     console = Console(width=max(Console().width, 118), highlight=False)
     summaries = summarize(rows, metrics)
-    all_shown = columns(rows, metrics)
     for kind in dict.fromkeys(row["kind"] for row in rows):
         of_kind = [row for row in rows if row["kind"] == kind]
+        all_shown = columns(of_kind, metrics)
         table = Table(title=f"{kind}: {counts(of_kind)}", title_justify="left", title_style="bold")
         table.add_column("method")
         table.add_column("shape")
@@ -83,7 +85,7 @@ def print_tables(rows: Sequence[Row], head: str, metrics: Sequence[Metric] = MET
                 "", "spread", *(row_cell(spread, shown) for shown in all_shown), style="dim", end_section=True
             )
         console.print(table)
-    console.print(f"{head}. {legend(rows, metrics)}\n")
+    console.print(f"{head.rstrip('.')}. {legend(rows, metrics)}\n")
 
 
 def counts(rows: Sequence[Row]) -> str:

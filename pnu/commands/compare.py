@@ -24,7 +24,8 @@ class Compare:
 
     commas: ClassVar = ("columns",)
     methods: list[str] = doc(
-        "run folders, folders of a sweep, and apss, poisson, midpoint; NAME:FOLDER gives a run another name"
+        "run folders, folders of a sweep, weights, and apss, poisson, midpoint, open3d (its usual chain); "
+        "NAME:FOLDER gives a run another name"
     )
     data: Group = doc(
         "Shapes: procedural, or of data=meshes data.root=FOLDER: meshes, pairs in clouds/ truth/ or input_N/ gt_N/"
@@ -34,7 +35,7 @@ class Compare:
     protocol: Group = doc("Protocol: sampling, frame, definitions")
     kinds: list[str] | None = doc(
         "of input: uniform, random, nonuniform, sparse (a quarter of the points), noise_0.5, noise_1, noise_2; "
-        "null: the protocol's"
+        "simulated scans: orbit, oneview, lines, photo, flipped; null: the protocol's"
     )
     points: int | None = doc("points of an input cloud; null: the protocol's")
     truth_points: int | None = doc("points on the true surface to compare with; null: the protocol's")
@@ -69,7 +70,8 @@ def compare(cfg: Any) -> None:
     from pnu.training.run_folder import versions
 
     protocol, source = protocol_source(cfg)
-    chosen = protocol.metrics(metrics.with_own(cfg.metrics, functools.partial(find_metric, allow=cfg.allow)))
+    find = functools.partial(find_metric, allow=cfg.allow)
+    chosen = protocol.metrics(metrics.with_own(cfg.metrics, find, benchmark.of_kinds(source.kinds)))
     rebuilt_kinds = source.kinds[:1] if cfg.surfaces is None else list(cfg.surfaces)
     if unknown := [kind for kind in rebuilt_kinds if kind not in source.kinds]:
         raise ValueError(f"surfaces={unknown[0]}: expected some of the kinds of input, {', '.join(source.kinds)}")
@@ -135,20 +137,23 @@ def upsamplers(cfg: Any) -> dict[str, "Method"]:
     for method in [one for given in cfg.methods for one in runs_of_sweep(given) or [given]]:
         name, _, folder = ("", "", method) if Path(method).exists() else method.rpartition(":")
         model: Any
-        if folder in CLASSICAL:
-            model, name = classical(folder), name or folder
+        if folder in (*CLASSICAL, "open3d"):
+            model, name = None if folder == "open3d" else classical(folder), name or folder
         elif Path(folder).is_dir():
             own = run_name(folder)  # the time tells two runs of one name apart
             name = name or (own if names[own] < 2 else Path(folder).resolve().name)
             model = checkpoints.load(folder, cfg.allow)
         elif weights.find(folder):
-            model, name = checkpoints.load(folder, cfg.allow), name or Path(folder).stem
+            model, name = benchmark.measured_network(folder, cfg.allow), name or Path(folder).stem
         else:
-            known = ", ".join([*CLASSICAL, *weights.shipped_names()])
+            known = ", ".join([*CLASSICAL, "open3d", *weights.shipped_names()])
             raise ValueError(f"methods={method}: expected a run folder, or one of {known}; found neither")
         if name in found or name in ("input", "floor", "truth"):
             cure = quoted("methods", [f"NAME:{folder}"])
             raise ValueError(f"methods={method}: the name {name} is taken; give another one, {cure}")
+        if model is None:
+            found[name] = benchmark.open3d_chain(cfg.ratio, cfg.seed)
+            continue
         found[name] = benchmark.network_upsampler(
             model,
             cfg.ratio,
@@ -170,7 +175,7 @@ def seen_in_training(cfg: Any, source: "CaseSource") -> list[str]:
     procedural = not cfg.data.get("root")
     for method in [one for given in cfg.methods for one in runs_of_sweep(given) or [given]]:
         name, _, folder = ("", "", method) if Path(method).exists() else method.rpartition(":")
-        if folder in CLASSICAL:
+        if folder in (*CLASSICAL, "open3d"):
             continue
         trained = trained_on(folder)
         if found := trained.of(source.shapes, procedural):

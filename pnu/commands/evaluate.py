@@ -27,7 +27,9 @@ class Evaluate:
     run: str | None = doc(
         "run folder, or name or file of weights; newest: the run that finished last; null: `method`, or surface"
     )
-    method: str | None = doc("upsampler without training instead of a run: apss, poisson or midpoint")
+    method: str | None = doc(
+        "upsampler without training instead of a run: apss, poisson, midpoint, or open3d, its usual chain"
+    )
     data: Group = doc(
         "Shapes: procedural, or of data=meshes data.root=FOLDER: meshes, pairs in clouds/ truth/ or input_N/ gt_N/"
     )
@@ -36,7 +38,7 @@ class Evaluate:
     protocol: Group = doc("Protocol: sampling, frame, definitions")
     kinds: list[str] | None = doc(
         "of input: uniform, random, nonuniform, sparse (a quarter of the points), noise_0.5, noise_1, noise_2; "
-        "null: the protocol's"
+        "simulated scans: orbit, oneview, lines, photo, flipped; null: the protocol's"
     )
     points: int | None = doc("points of an input cloud; null: the protocol's")
     truth_points: int | None = doc("points on the true surface to compare with; null: the protocol's")
@@ -69,13 +71,17 @@ def evaluate(cfg: Any) -> None:
     from pnu.upsamplers import classical
 
     protocol, source = protocol_source(cfg)
-    chosen = protocol.metrics(metrics.with_own(cfg.metrics, functools.partial(find_metric, allow=cfg.allow)))
+    find = functools.partial(find_metric, allow=cfg.allow)
+    chosen = protocol.metrics(metrics.with_own(cfg.metrics, find, benchmark.of_kinds(source.kinds)))
     subject = cfg.method or str(checkpoints.resolve(cfg.run or DEFAULT[cfg.normals]))
-    model = classical(subject) if cfg.method else checkpoints.load(subject, cfg.allow)
-    upsampler = benchmark.network_upsampler(
-        model, cfg.ratio, passes=cfg.passes, name=subject, patch_size=cfg.patch_size, batch_size=cfg.batch_size,
-        device=cfg.device, seed=cfg.seed,
-    )  # fmt: skip
+    if cfg.method == "open3d":
+        upsampler = benchmark.open3d_chain(cfg.ratio, cfg.seed)
+    else:
+        model = classical(subject) if cfg.method else benchmark.measured_network(subject, cfg.allow)
+        upsampler = benchmark.network_upsampler(
+            model, cfg.ratio, passes=cfg.passes, name=subject, patch_size=cfg.patch_size, batch_size=cfg.batch_size,
+            device=cfg.device, seed=cfg.seed,
+        )  # fmt: skip
     is_run = not cfg.method and Path(subject).is_dir()
     name = run_name(subject) if is_run else Path(subject).stem
     default = Path(subject, "evaluation") if is_run else Path("outputs", "evaluation", name)

@@ -162,8 +162,10 @@ METRICS: tuple[Metric, ...] = (
 """In the order of the tables."""
 
 
-def with_own(names: Iterable[str], find: Callable[[str], type]) -> tuple[Metric, ...]:
-    """`METRICS`, and those of the classes with these dotted names.
+def with_own(
+    names: Iterable[str], find: Callable[[str], type], metrics: Sequence[Metric] = METRICS
+) -> tuple[Metric, ...]:
+    """The metrics, and those of the classes with these dotted names.
 
     Args:
         find: gives the class of a dotted name, and decides whose code may run.
@@ -171,7 +173,7 @@ def with_own(names: Iterable[str], find: Callable[[str], type]) -> tuple[Metric,
     Raises:
         ValueError: no subclass of `Metric`, or one whose name in files is taken.
     """
-    found = list(METRICS)
+    found = list(metrics)
     for name in names:
         cls = find(name)
         if not (issubclass(cls, Metric) and isinstance(getattr(cls, "shown", None), Shown)):

@@ -5,6 +5,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from torch import Tensor
+
+from pnu.metrics.declared import P2F, Flipped, Metric, NormalUnsignedDeg, Shown
+from pnu.metrics.functional import Pair
 
 STRAY = 0.03  # distance from the true surface beyond which a point is stray
 
@@ -38,3 +42,60 @@ def scan_scores(
         "flipped": 100 * (cosine < 0).mean(),
     }
     return {name: float(value) for name, value in scores.items()}
+
+
+class P2F95(Metric):
+    """95th percentile of the distances to the true mesh."""
+
+    shown = Shown("p2f_95", "P2F x 1e3, 95th percentile", "P2F 95", 1e3, "length")
+    needs = ("mesh",)
+    patches = False
+
+    def __call__(self, pair: Pair) -> Tensor:
+        """Values (B,)."""
+        return pair.prediction.new_tensor(np.quantile(pair.on_mesh[0], 0.95, axis=1))
+
+
+class Stray(Metric):
+    """Share of the points farther than 0.03 from the true mesh."""
+
+    shown = Shown("stray", f"stray, farther than {STRAY} (%)", "stray", 100.0, "share", ".2f")
+    words = f"stray: % of the points farther than {STRAY} from the true mesh"
+    needs = ("mesh",)
+    patches = False
+
+    def __call__(self, pair: Pair) -> Tensor:
+        """Values (B,)."""
+        return pair.prediction.new_tensor((pair.on_mesh[0] > STRAY).mean(1))
+
+
+class Completeness(Metric):
+    """Mean distance of the true points to the next point."""
+
+    shown = Shown("completeness", "completeness x 1e3", "complete", 1e3, "length", ".2f")
+    words = (
+        "complete: mean distance of points of the truth (what a scan has seen of it) to the next point; gap: largest"
+    )
+    patches = False
+
+    def __call__(self, pair: Pair) -> Tensor:
+        """Values (B,)."""
+        return pair.back.dist_sq.sqrt().mean(1)
+
+
+class Gap(Metric):
+    """Largest distance of a true point to the next point."""
+
+    shown = Shown("gap", "largest gap x 1e3", "gap", 1e3, "length", ".1f")
+    patches = False
+
+    def __call__(self, pair: Pair) -> Tensor:
+        """Values (B,)."""
+        return pair.back.dist_sq.sqrt().amax(1)
+
+
+SCAN_METRICS: tuple[Metric, ...] = (P2F95(), Stray(), Completeness(), Gap())
+"""What is measured of clouds made from scans alone, beside `SHARED`."""
+
+SHARED = (P2F, NormalUnsignedDeg, Flipped)
+"""What is measured of them as of all clouds; P2F is their accuracy."""
