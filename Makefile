@@ -21,7 +21,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(BIN)/pnu doctor --install
 	@touch $@
 
-setup: $(STAMP)   ## virtual environment in .venv, pinned packages, pnu itself, system libraries
+setup: $(STAMP)   ## virtual environment in .venv, pinned packages, pnu itself, system libraries, compiled kernels
 
 check: $(STAMP)   ## lint, format and types
 	$(BIN)/ruff check .

@@ -25,7 +25,7 @@ PARTS: dict[str, Callable[[], Iterable[Row]]] = {
     "step": step.step_rows,
     "inference": inference.rows,
 }
-PACKAGES = ("torch", "numpy", "scipy", "fpsample", "open3d")
+PACKAGES = ("torch", "numpy", "scipy", "numba", "open3d")
 
 
 def facts() -> dict[str, str]:

@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from pnu.kernels import compilation
+
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # before anything imports triton: kernels then run on the CPU
 
@@ -30,3 +32,10 @@ def untraced(monkeypatch: pytest.MonkeyPatch) -> None:
     """Commands run without coverage, which slows them down, writes a file, and which Hydra takes for a debugger."""
     monkeypatch.delenv("COVERAGE_PROCESS_CONFIG", raising=False)
     monkeypatch.setattr("hydra._internal.utils.is_under_debugger", lambda: False)
+
+
+@pytest.fixture(scope="session")
+def compiled() -> None:
+    """Kernels are compiled, as `make setup` does it; tests of them skip where numba is missing."""
+    if not compilation.compile_all():
+        pytest.skip("kernels cannot be compiled here")

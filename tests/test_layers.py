@@ -20,6 +20,7 @@ ROOMS = [
         "config",
         "weights",
         "runtime",
+        "kernels",
         "geometry",
         "data",
         "networks",
@@ -31,7 +32,7 @@ ROOMS = [
     ),
     *("reconstruction", "upsamplers", "training", "benchmark", "report", "commands", "train", "__main__"),
 ]
-HEAVY = {"torch", "lightning", "hydra", "open3d", "tensorboard", "torchmetrics", "scipy", "h5py", "trimesh"}
+HEAVY = {"torch", "lightning", "hydra", "open3d", "tensorboard", "torchmetrics", "scipy", "h5py", "trimesh", "numba"}
 
 
 WHOLE = {"docs", "examples", "extending", "layers", "nightly", "side_effects", "wheel"}  # tests of no room alone

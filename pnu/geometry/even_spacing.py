@@ -75,7 +75,7 @@ def repel(
     for _ in range(steps):
         search = Search(points)
         for part in parts:
-            found = search.knn(points[part], k)
+            found = search.knn(points[part], k, ordered=True)
             dist[part], idx[part] = found.dist_sq[:, 1:].sqrt(), found.idx[:, 1:].int()
             done += 1
             step(done, total)

@@ -4,28 +4,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pnu import kernels
 from pnu.geometry.farthest_blocks import farthest_in_blocks
 from pnu.geometry.neighbor_search import gpu_kernels, nearest, per_cloud
+from pnu.geometry.spatial_blocks import split_blocks
 from pnu.runtime.progress import Step, silent
 
-try:
-    import fpsample
-except ImportError:  # Python 3.13, for which it has no wheel: plain steps, smaller blocks
-    fpsample = None
-
 NEAR_ORIGIN_SQ = 1e-3  # the released code's threshold on |x|^2
-BUCKETS_PAY = 2**16  # from this many distances on
-LARGE = 2**18 if fpsample else 2**14  # points; more are sampled in blocks
-LARGE_BLOCK = None if fpsample else 2**12  # of so many points, None the default,
-LARGE_SHARE = 64 if fpsample else 4  # unless so few are wanted that blocks would hold too few of them
+LARGE = 2**18  # points; more are sampled in blocks,
+LARGE_BLOCK: int | None = None  # of so many points, None the default of `farthest_blocks`,
+LARGE_SHARE = 64  # unless so few are wanted that blocks would hold too few of them
+BLOCKS_PAY = 2**14  # points from which on plain steps look at near blocks alone,
+NEAR_BLOCK = 2**9  # of at most so many points
 
 
 def farthest_points(points: Tensor, m: int, *, start: int | Tensor = 0, skip_near_origin: bool = False) -> Tensor:
     """Greedy farthest point sampling: from `start` on, always the point farthest from all chosen before.
 
     points (B, n, 3), start one index or (B,) -> idx (B, m) int64 in the order of choice, all different; computed in
-    float32, equal distances in any order. With `skip_near_origin` (released code) points with |x|^2 <= 1e-3 are chosen
-    as the start only, and when the others run out the first of them is repeated. ValueError if m is not in 1..n.
+    float32, of equal distances the lowest index. With `skip_near_origin` (released code) points with |x|^2 <= 1e-3 are
+    chosen as the start only, and when the others run out the first of them is repeated. ValueError if m is not in 1..n.
     """
     clouds, n, _ = points.shape
     _check_count(m, n)
@@ -122,14 +120,12 @@ def _float32(points: Tensor) -> Tensor:
 
 
 def _farthest(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
-    chosen = _greedy(xyz, m, start)
-    different = np.unique(chosen, return_index=True)[1]
-    if len(different) == m:
-        return chosen
-    # the cloud has duplicates: once all places are taken the sampler repeats itself
-    kept = chosen[np.sort(different)]
-    rest = np.setdiff1d(np.arange(len(xyz)), kept)
-    return np.concatenate([kept, rest[: m - len(kept)]])
+    """Of equal distances the lowest index, so that all three ways give the same."""
+    if kernels.ready():
+        from pnu.kernels.greedy_sampling import farthest_first
+
+        return farthest_first(xyz, m, start)
+    return (_farthest_near if len(xyz) > BLOCKS_PAY else _farthest_plain)(xyz, m, start)
 
 
 def _farthest_off_origin(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
@@ -141,21 +137,7 @@ def _farthest_off_origin(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
     return np.concatenate([chosen, np.full(m - len(chosen), refill)])
 
 
-def _greedy(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
-    """Bucket sampler (QuickFPS) where it pays; it counts its start in its own tree's order."""
-    n = len(xyz)
-    if fpsample is None:
-        return _greedy_steps(xyz, m, start)
-    if n >= 16 and m * n > BUCKETS_PAY:
-        height = max(3, round(np.log2(n) / 2 - 1))
-        chosen: np.ndarray = fpsample.bucket_fps_kdline_sampling(xyz, m, height, _tree_slot(xyz, height, start))
-        if chosen[0] == start:
-            return chosen.astype(np.int64)
-    chosen = fpsample.fps_sampling(xyz, m, start)
-    return chosen.astype(np.int64)
-
-
-def _greedy_steps(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
+def _farthest_plain(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
     axes, step = np.ascontiguousarray(xyz.T), np.empty_like(xyz.T, order="C")
     dist_sq, chosen = np.full(len(xyz), np.inf, np.float32), np.empty(m, np.int64)
     for i in range(m):
@@ -163,25 +145,38 @@ def _greedy_steps(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
         np.subtract(axes, axes[:, start, None], out=step)
         np.multiply(step, step, out=step)
         np.minimum(dist_sq, step.sum(0), out=dist_sq)
+        dist_sq[start] = -1
         start = int(dist_sq.argmax())
     return chosen
 
 
-def _tree_slot(xyz: np.ndarray, height: int, start: int) -> int:
-    """Where fpsample's tree puts a point: nodes are cut at the mean of their widest axis by swaps from both ends."""
-    order, offset = np.arange(len(xyz)), 0
-    for _ in range(height):
-        node = xyz[order]
-        value = node[:, np.ptp(node, axis=0).argmax()]
-        low = value < np.cumsum(value, dtype=np.float32)[-1] / np.float32(len(value))
-        cut = int(low.sum())
-        high_left, low_right = np.flatnonzero(~low[:cut]), cut + np.flatnonzero(low[cut:])[::-1]
-        order[high_left], order[low_right] = order[low_right], order[high_left]
-        if np.flatnonzero(order == start)[0] < cut:
-            order = order[:cut]
-        else:
-            order, offset = order[cut:], offset + cut
-    return offset + int(np.flatnonzero(order == start)[0])
+def _farthest_near(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
+    """The same with a look at those blocks alone that are nearer than their farthest point is to all chosen before."""
+    blocks = split_blocks(xyz, NEAR_BLOCK)
+    number, size = len(blocks.members), max(len(part) for part in blocks.members)
+    dist_sq, ids = np.full((number, size), -2, np.float32), np.full((number, size), len(xyz))
+    axes, home = np.zeros((number, 3, size), np.float32), np.empty((len(xyz), 2), np.int64)
+    for row, part in enumerate(blocks.members):
+        dist_sq[row, : len(part)], ids[row, : len(part)], axes[row, :, : len(part)] = np.inf, part, xyz[part].T
+        home[part, 0], home[part, 1] = row, np.arange(len(part))
+    low, high = (np.ascontiguousarray(corners.T, np.float32) for corners in (blocks.low, blocks.high))
+    best, best_id = dist_sq.max(1), ids[:, 0].copy()
+    chosen = np.empty(m, np.int64)
+    for i in range(m):
+        chosen[i] = start
+        place, own = xyz[start, :, None], home[start, 0]
+        apart = np.maximum(np.maximum(low - place, place - high), 0)
+        near = (apart * apart).sum(0) < best
+        near[own] = True
+        rows = near.nonzero()[0]
+        step = axes[rows] - place
+        part = np.minimum(dist_sq[rows], (step * step).sum(1))
+        part[np.searchsorted(rows, own), home[start, 1]] = -1
+        dist_sq[rows] = part
+        farthest = part.argmax(1)
+        best[rows], best_id[rows] = part[np.arange(len(rows)), farthest], ids[rows, farthest]
+        start = int(best_id[best == best.max()].min())
+    return chosen
 
 
 def _farthest_steps(points: Tensor, m: int, start: Tensor, skip_near_origin: bool) -> Tensor:

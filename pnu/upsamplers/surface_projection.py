@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pnu.fast.compiled_projector import compiled_projection, compiled_spheres
 from pnu.geometry.cloud_statistics import FAINT
 from pnu.geometry.even_spacing import repel, tangent_discs
 from pnu.geometry.local_frames import feet
@@ -19,6 +20,7 @@ from pnu.geometry.noise_level import noise_level
 from pnu.geometry.sampling import farthest_points_large
 from pnu.geometry.spacing import spacing
 from pnu.geometry.spatial_blocks import along_curve
+from pnu.kernels.compilation import compile_in_background
 from pnu.networks.surface import Surface
 from pnu.runtime import threads
 from pnu.runtime.progress import Progress, Step, silent
@@ -34,6 +36,7 @@ BATCHES = 32  # of which its threads share so many
 AROUND = 8  # points of which one at most is dropped,
 DOUBTFUL = 16  # looked for among so many for each point to drop
 ROOM = 0.7  # around a point that is kept, in spacings that evenly spread points would have
+LONG = 10_000  # points made from which on a computation takes long enough to have kernels compiled beside it
 CLOSE = 12  # neighbors of the sphere that candidates are first moved to
 
 
@@ -55,6 +58,8 @@ class SurfaceProjection:
 
         The points of a cloud that is noisy beside their spacing are themselves projected first.
         """
+        if count >= LONG and cloud.device.type == "cpu":
+            compile_in_background()
         if noise_in_spacings(cloud) > SMOOTH:
             smooth, _ = self.projected(cloud, cloud, context, "smoothing, the points are noisy")
             measured, cloud = cloud, smooth
@@ -151,9 +156,14 @@ def in_parts(
 def projections(network: Surface, cloud: Tensor, batch_size: int | None = None) -> Work:
     """Around a cloud (n, 6): queries (m, 6) -> projected and logarithm of the expected error, (m, 7)."""
     ranks = network.ranks(len(cloud))
+    compiled = compiled_projection(network)
 
     def project(query: Tensor, cloud: Tensor, idx: Tensor) -> Tensor:
-        projected, log_error, spacing = network.project(query[None], cloud[None], idx[None, :, ranks])
+        if len(ranks) < idx.shape[1]:
+            idx = idx[:, ranks]
+        if compiled:
+            return compiled(query, cloud, idx)
+        projected, log_error, spacing = network.project(query[None], cloud[None], idx[None])
         return torch.cat([projected[0], (log_error[0] + spacing[0].log()).to(projected)[:, None]], 1)
 
     return by_neighbors(project, cloud.to(network.projector.out.weight.device), network.reach, batch_size)
@@ -162,8 +172,11 @@ def projections(network: Surface, cloud: Tensor, batch_size: int | None = None) 
 def spheres(network: Surface, cloud: Tensor, batch_size: int | None = None) -> Work:
     """As `projections`, but to the sphere that fits the nearest points, without network and expected error."""
     like = network.projector.out.weight
+    compiled = compiled_spheres(like)
 
     def project(query: Tensor, cloud: Tensor, idx: Tensor) -> Tensor:
+        if compiled:
+            return compiled(query, cloud, idx)
         near = cloud[idx]
         offsets = near[..., :3] - query[:, None, :3]
         step, normal = (x.to(query) for x in feet(*(x.to(like) for x in (offsets, near[..., 3:], query[:, 3:]))))
@@ -184,7 +197,7 @@ def by_neighbors(
 
     def work(query: Tensor) -> Tensor:
         query = query.to(cloud)
-        idx = search.knn(query[:, :3], min(k, len(cloud))).idx
+        idx = search.knn(query[:, :3], min(k, len(cloud)), ordered=True).idx
         batches = [slice(start, start + size) for start in range(0, len(query), size)]
 
         def batch(part: slice) -> Tensor:

@@ -25,7 +25,7 @@ def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-@pytest.fixture(params=["vanilla", "buckets", "without fpsample", "steps"])
+@pytest.fixture(params=["compiled", "plain", "near blocks", "steps"])
 def path(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """The samplers of the CPU, whatever the size, and the loop of other devices."""
     if request.param == "steps":
@@ -34,10 +34,12 @@ def path(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Non
             return module._farthest_steps(points.float(), m, torch.full((len(points),), start), skip_near_origin)
 
         monkeypatch.setattr("tests.geometry.test_sampling.farthest_points", steps)
-    elif request.param == "without fpsample":
-        monkeypatch.setattr(module, "fpsample", None)
+    elif request.param == "compiled":
+        request.getfixturevalue("compiled")
     else:
-        monkeypatch.setattr(module, "BUCKETS_PAY", 0 if request.param == "buckets" else 2**62)
+        monkeypatch.setenv("PNU_FAST", "0")
+        monkeypatch.setattr(module, "NEAR_BLOCK", 16)
+        monkeypatch.setattr(module, "BLOCKS_PAY", 0 if request.param == "near blocks" else 2**62)
 
 
 @pytest.mark.usefixtures("path")
@@ -79,18 +81,12 @@ def test_duplicates_are_never_chosen_twice() -> None:
 
 
 @pytest.mark.parametrize("n", [1000, 4096, 20_000])
-def test_buckets_start_where_told_and_agree_with_the_plain_loop(n: int) -> None:
+def test_all_ways_choose_the_same(n: int) -> None:
     points = cloud(1, n, seed=n)
     for start in (0, 1, n // 2, n - 1):
         fast = farthest_points(points, 200, start=start)
         assert torch.equal(fast, module._farthest_steps(points, 200, torch.tensor([start]), False))
-
-
-def test_a_lost_start_is_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    points = cloud(1, 3000, seed=4)
-    right = farthest_points(points, 500, start=7)
-    monkeypatch.setattr(module, "_tree_slot", lambda xyz, height, start: 0)
-    assert torch.equal(farthest_points(points, 500, start=7), right)
+        np.testing.assert_array_equal(fast[0], module._farthest_near(points[0].numpy(), 200, start))
 
 
 def test_one_start_for_each_cloud() -> None:

@@ -1,0 +1,66 @@
+"""The nearest points of a cloud on the CPU: a compiled search, or SciPy's where that is not to be had."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from pnu import kernels
+
+CHUNK = 2048  # queries that a thread takes at once
+FEW = 256  # queries whose order does not matter
+
+
+class PointTree:
+    """The nearest of some points (n, 3), n >= 1, in float64, looked up again and again."""
+
+    def __init__(self, points: NDArray[np.floating]) -> None:
+        self.points = np.asarray(points, np.float64)
+        self.compiled = kernels.ready()
+        if self.compiled:
+            from pnu.kernels.neighbors import NeighborTree
+
+            self.tree = NeighborTree(self.points)
+        else:
+            self.plain = cKDTree(self.points)
+
+    def nearest(
+        self, queries: NDArray[np.floating], k: int, *, threads: int = 1
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Distances (m, k) of each query (m, 3) to its k <= n nearest points, ascending, and which points they are."""
+        dist, idx = self.nearest_sq(queries, k, threads=threads)
+        return np.sqrt(dist, out=dist), idx
+
+    def among_themselves(self, k: int, *, threads: int = 1) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Distances (n, k - 1) of each point to its k - 1 nearest others, ascending, and which points they are."""
+        dist, idx = self.nearest(self.points, k, threads=threads)
+        return dist[:, 1:], idx[:, 1:]
+
+    def nearest_sq(
+        self, queries: NDArray[np.floating], k: int, *, threads: int = 1, ordered: bool = False
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """As `nearest`, but squared distances. ordered: queries come along a curve, which saves time."""
+        if not self.compiled:
+            dist, idx = self.plain.query(queries, k=np.arange(1, k + 1), workers=threads)
+            return np.multiply(dist, dist, out=dist), idx
+        if not ordered and len(queries) > FEW:
+            order = self._order(np.asarray(queries, np.float64))
+            back = np.empty_like(order)
+            back[order] = np.arange(len(order))
+            dist, idx = self.nearest_sq(queries[order], k, threads=threads, ordered=True)
+            return dist[back], idx[back]
+        parts = [queries[start : start + CHUNK] for start in range(0, len(queries), CHUNK)]
+        if threads == 1 or len(parts) < 2:
+            idx, dist = self.tree.search(queries, k)
+            return dist, idx
+        with ThreadPoolExecutor(threads) as pool:
+            found = list(pool.map(lambda part: self.tree.search(part, k), parts))
+        return np.concatenate([dist for _, dist in found]), np.concatenate([idx for idx, _ in found])
+
+    def _order(self, queries: NDArray[np.float64]) -> NDArray[np.int64]:
+        if queries is self.points:
+            return np.asarray(self.tree.order)
+        from pnu.kernels.boxes import box_order
+
+        return np.asarray(box_order(np.require(queries, np.float64, ["C", "W", "A"]), FEW))

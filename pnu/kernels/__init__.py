@@ -1,0 +1,22 @@
+"""Loops over points compiled for this machine's processor with numba: arrays in, arrays out, no torch.
+
+`ready` is the one switch. Whoever asks it has another way that gives the same numbers, and takes that where numba is
+missing, `PNU_FAST=0` is set, or the kernels are not compiled yet (`pnu.kernels.compilation`).
+
+| file | what |
+|---|---|
+| `compilation` | where compiled code is kept, and how it comes there |
+| `vectors`, `tiles` | several float32 at once, and matrix products made of them |
+| `boxes` | a cloud in the order of a tree of boxes, on which the next two search |
+| `neighbors`, `greedy_sampling` | the k nearest points, and farthest point sampling |
+| `frames`, `projector` | the surface model: local frames and spheres; the network on them |
+"""
+
+import os
+
+from pnu.kernels.compilation import complete
+
+
+def ready() -> bool:
+    """Whether compiled kernels answer here and now; importing them takes a fraction of a second then."""
+    return os.environ.get("PNU_FAST") != "0" and complete()

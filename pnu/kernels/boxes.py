@@ -1,0 +1,78 @@
+"""A cloud in the order of a tree of boxes: what searches walk along. Memory and time follow the points, not the space
+they fill, and points that are equal, on a line or far away are no special case."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnu.kernels.compilation import kernel
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@kernel(exact=True, inner=True)
+def _swap(place: Floats, order: Ints, i: int, j: int) -> None:
+    order[i], order[j] = order[j], order[i]
+    for axis in range(3):
+        place[i, axis], place[j, axis] = place[j, axis], place[i, axis]
+
+
+@kernel(exact=True, inner=True)
+def _split(place: Floats, order: Ints, first: int, stop: int, cut: int, axis: int) -> None:
+    """Points before `cut` are not above those from it on (Hoare's selection)."""
+    low, high = first, stop - 1
+    while low < high:
+        a, b, c = place[low, axis], place[(low + high) // 2, axis], place[high, axis]
+        pivot = max(min(a, b), min(max(a, b), c))
+        i, j = low, high
+        while i <= j:
+            while place[i, axis] < pivot:
+                i += 1
+            while place[j, axis] > pivot:
+                j -= 1
+            if i <= j:
+                _swap(place, order, i, j)
+                i += 1
+                j -= 1
+        if cut <= j:
+            high = j
+        elif cut >= i:
+            low = i
+        else:
+            break
+
+
+@kernel("int64[::1](float64[:, ::1], int64)", exact=True)
+def box_order(points: Floats, leaf: int) -> Ints:
+    """An order of points (n, 3) whose every run of 2^i leaves, of `leaf` points each, fills a box of its own: (n,).
+
+    Boxes are halved along their longest side; the first half gets the greatest power of two of leaves that leaves some
+    for the second. So leaf l belongs to node l // 2^i of level i.
+    """
+    n = len(points)
+    place, order = points.copy(), np.arange(n)
+    waiting = np.empty((128, 2), np.int64)
+    waiting[0, 0], waiting[0, 1] = 0, n
+    depth = 1
+    while depth:
+        depth -= 1
+        first, stop = waiting[depth]
+        leaves = (stop - first + leaf - 1) // leaf
+        if leaves < 2:
+            continue
+        half = 1
+        while 2 * half < leaves:
+            half *= 2
+        axis, widest = 0, -1.0
+        for a in range(3):
+            low = high = place[first, a]
+            for i in range(first, stop):
+                low, high = min(low, place[i, a]), max(high, place[i, a])
+            if high - low > widest:
+                axis, widest = a, high - low
+        cut = first + half * leaf
+        _split(place, order, first, stop, cut, axis)
+        waiting[depth, 0], waiting[depth, 1] = first, cut
+        waiting[depth + 1, 0], waiting[depth + 1, 1] = cut, stop
+        depth += 2
+    return order

@@ -1,0 +1,222 @@
+"""The k nearest points of a cloud, exact in float64, on a tree of boxes with eight children each.
+
+A search collects all points within a radius, in which the last query found its k along the curve that queries come in,
+or else the nearest box. What it gives depends on neither: neighbors come by distance, equal ones by their index.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnu.kernels.boxes import Floats, Ints, box_order
+from pnu.kernels.compilation import kernel
+
+LEAF = 16  # points
+CHILDREN = 8
+NOWHERE = 1e150  # places of points and boxes that are not there; its square is finite
+MORE = 1.6  # times the squared radius in which the query before found its neighbors
+ROOM = 8  # times k, at most, are collected before those too far are dropped
+
+
+class NeighborTree:
+    """A cloud (n, 3), n >= 1, made ready for searches."""
+
+    def __init__(self, points: NDArray[np.floating]) -> None:
+        points = np.require(points, np.float64, ["C", "W", "A"])
+        self.order = box_order(points, LEAF)  # of the points, in which neighbors come soon after each other
+        self.parts = _tree(points, self.order)
+
+    def search(self, queries: NDArray[np.floating], k: int) -> tuple[Ints, Floats]:
+        """The k <= n nearest points of each query (m, 3): `idx[i, j]` is the j-th nearest of query i, and their squared
+        distances, both (m, k). Fast where each query is near the one before (`box_order`)."""
+        queries = np.require(queries, np.float64, ["C", "W", "A"])
+        idx, dist_sq = np.empty((len(queries), k), np.int64), np.empty((len(queries), k))
+        _search(queries, k, *self.parts, idx, dist_sq)
+        return idx, dist_sq
+
+
+@kernel("Tuple((float64[:, ::1], int64[::1], float64[:, :, ::1], int64[::1]))(float64[:, ::1], int64[::1])", exact=True)
+def _tree(points: Floats, order: Ints) -> tuple[Floats, Ints, Floats, Ints]:
+    """Coordinates (3, leaves x LEAF) in order; their indices; children's boxes (groups, 6, CHILDREN), low and high
+    corners; the first group of each level, that of leaves first, and the end."""
+    n = len(points)
+    leaves = (n + LEAF - 1) // LEAF
+    axes, ids = np.full((3, leaves * LEAF), NOWHERE), np.zeros(leaves * LEAF, np.int64)
+    for i in range(n):
+        ids[i] = order[i]
+        for axis in range(3):
+            axes[axis, i] = points[order[i], axis]
+    levels = np.zeros(24, np.int64)
+    depth, nodes = 0, leaves
+    while True:
+        nodes = (nodes + CHILDREN - 1) // CHILDREN
+        levels[depth + 1] = levels[depth] + nodes
+        depth += 1
+        if nodes == 1:
+            break
+    boxes = np.empty((levels[depth], 6, CHILDREN))
+    boxes[:, :3], boxes[:, 3:] = NOWHERE, -NOWHERE
+    for i in range(n):
+        leaf = i // LEAF
+        box = boxes[leaf // CHILDREN]
+        child = leaf % CHILDREN
+        for axis in range(3):
+            box[axis, child] = min(box[axis, child], axes[axis, i])
+            box[3 + axis, child] = max(box[3 + axis, child], axes[axis, i])
+    for level in range(1, depth):
+        for group in range(levels[level] - levels[level - 1]):
+            box, below = boxes[levels[level] + group // CHILDREN], boxes[levels[level - 1] + group]
+            for axis in range(3):
+                box[axis, group % CHILDREN] = below[axis].min()
+                box[3 + axis, group % CHILDREN] = below[3 + axis].max()
+    return axes, ids, boxes, levels[: depth + 1].copy()
+
+
+@kernel(exact=True, inner=True)
+def _before(a: float, i: int, b: float, j: int) -> bool:
+    return a < b or (a == b and i < j)
+
+
+@kernel(exact=True, inner=True)
+def _keep_nearest(dist: Floats, ids: Ints, count: int, k: int) -> None:
+    """Bring the k nearest of `count` points to the front, in any order (Hoare's selection)."""
+    low, high = 0, count - 1
+    cut = k - 1
+    while low < high:
+        middle = (low + high) // 2
+        pivot, pivot_id = dist[middle], ids[middle]
+        i, j = low, high
+        while i <= j:
+            while _before(dist[i], ids[i], pivot, pivot_id):
+                i += 1
+            while _before(pivot, pivot_id, dist[j], ids[j]):
+                j -= 1
+            if i <= j:
+                dist[i], dist[j] = dist[j], dist[i]
+                ids[i], ids[j] = ids[j], ids[i]
+                i += 1
+                j -= 1
+        if cut <= j:
+            high = j
+        elif cut >= i:
+            low = i
+        else:
+            break
+
+
+@kernel(exact=True, inner=True)
+def _to_boxes(x: float, y: float, z: float, box: Floats, far: Floats) -> None:
+    """Squared distances (CHILDREN,) of a place to boxes (6, CHILDREN)."""
+    for child in range(CHILDREN):
+        dx = max(max(box[0, child] - x, x - box[3, child]), 0.0)
+        dy = max(max(box[1, child] - y, y - box[4, child]), 0.0)
+        dz = max(max(box[2, child] - z, z - box[5, child]), 0.0)
+        far[child] = dx * dx + dy * dy + dz * dz
+
+
+@kernel(exact=True, inner=True)
+def _enough(
+    x: float, y: float, z: float, k: int, n: int, axes: Floats, boxes: Floats, levels: Ints, far: Floats, dist: Floats
+) -> float:
+    """A squared radius in which there are k points: those of the smallest node near the place that has so many."""
+    level, group, size = len(levels) - 2, 0, LEAF * CHILDREN ** (len(levels) - 1)
+    first, stop = 0, n
+    while level >= 0:
+        _to_boxes(x, y, z, boxes[levels[level] + group], far)
+        child = 0
+        for other in range(1, CHILDREN):
+            if far[other] < far[child]:
+                child = other
+        size //= CHILDREN
+        group = group * CHILDREN + child
+        if min((group + 1) * size, n) - group * size < k:
+            break
+        first, stop = group * size, min((group + 1) * size, n)
+        level -= 1
+    if stop - first > len(dist):
+        stop = first + len(dist)
+    for i in range(first, stop):
+        dx, dy, dz = axes[0, i] - x, axes[1, i] - y, axes[2, i] - z
+        dist[i - first] = dx * dx + dy * dy + dz * dz
+    return np.partition(dist[: stop - first], k - 1)[k - 1]
+
+
+@kernel(exact=True, inner=True)
+def _within(
+    x: float, y: float, z: float, limit: float, k: int, axes: Floats, ids: Ints, boxes: Floats, levels: Ints,
+    far: Floats, stack: Ints, dist: Floats, found: Ints,
+) -> int:  # fmt: skip
+    """Points within a squared radius, in any order, without some of those that cannot be among the k nearest.
+
+    Of very many at the place of the query the first k that come; -1 where that was found out later than from a radius
+    of zero on, in which case the search begins anew from there: so those that come first are always the same.
+    """
+    count, depth, begun = 0, 1, limit
+    stack[0, 0], stack[0, 1] = len(levels) - 2, 0
+    while depth:
+        depth -= 1
+        level, group = stack[depth]
+        _to_boxes(x, y, z, boxes[levels[level] + group], far)
+        for child in range(CHILDREN):
+            if far[child] > limit:
+                continue
+            below = group * CHILDREN + child
+            if level:
+                stack[depth, 0], stack[depth, 1] = level - 1, below
+                depth += 1
+                continue
+            first = below * LEAF
+            for i in range(LEAF):
+                dx, dy, dz = axes[0, first + i] - x, axes[1, first + i] - y, axes[2, first + i] - z
+                dist[count + i] = dx * dx + dy * dy + dz * dz
+            start = count
+            for i in range(LEAF):
+                near = dist[start + i]
+                dist[count], found[count] = near, ids[first + i]
+                count += near <= limit
+            if count + LEAF > len(found):
+                _keep_nearest(dist, found, count, k)
+                count, limit = k, dist[:k].max()
+                if limit == 0:  # no other can be nearer
+                    return k if begun == 0 else -1
+    return count
+
+
+@kernel(
+    "void(float64[:, ::1], int64, float64[:, ::1], int64[::1], float64[:, :, ::1], int64[::1], int64[:, ::1],"
+    " float64[:, ::1])",
+    exact=True,
+)
+def _search(
+    queries: Floats, k: int, axes: Floats, ids: Ints, boxes: Floats, levels: Ints, idx: Ints, dist_sq: Floats
+) -> None:
+    """See `NeighborTree.search`."""
+    n = len(ids)
+    while n and axes[0, n - 1] == NOWHERE:
+        n -= 1
+    room = ROOM * k + 4 * LEAF * CHILDREN
+    dist, found, sorted_ = np.empty(room), np.empty(room, np.int64), np.empty(room, np.int64)
+    nearby = np.empty(max(room, CHILDREN * k + LEAF * CHILDREN))
+    far, stack = np.empty(CHILDREN), np.empty((24 * CHILDREN, 2), np.int64)
+    limit = -1.0
+    for q in range(len(queries)):
+        x, y, z = queries[q]
+        count = 0
+        if limit >= 0:
+            count = _within(x, y, z, limit * MORE, k, axes, ids, boxes, levels, far, stack, dist, found)
+        if 0 <= count < k:
+            limit = _enough(x, y, z, k, n, axes, boxes, levels, far, nearby)
+            count = _within(x, y, z, limit, k, axes, ids, boxes, levels, far, stack, dist, found)
+        if count < 0:
+            count = _within(x, y, z, 0.0, k, axes, ids, boxes, levels, far, stack, dist, found)
+        if count > 2 * k + LEAF:
+            _keep_nearest(dist, found, count, k)
+            count = k
+        for i in range(count):
+            rank = 0
+            for j in range(count):
+                rank += (dist[j] < dist[i]) | ((dist[j] == dist[i]) & (found[j] < found[i]))
+            sorted_[i] = rank
+        for i in range(count):
+            if sorted_[i] < k:
+                idx[q, sorted_[i]], dist_sq[q, sorted_[i]] = found[i], dist[i]
+        limit = dist_sq[q, k - 1]

@@ -1,0 +1,113 @@
+"""Where compiled kernels are kept: what is found, what is not, and that nothing of it is an error."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pnu import kernels
+from pnu.commands.doctor import kernels_line
+from pnu.kernels import compilation
+
+KERNEL = "KERNELS", ("boxes",)
+
+
+@pytest.fixture
+def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A machine on which nothing is compiled, and where compiling means to import one file that is."""
+    monkeypatch.setattr(compilation, "folder", lambda: tmp_path / "kernels-new")
+    monkeypatch.setattr("pnu.commands.doctor.folder", compilation.folder)
+    monkeypatch.setattr(compilation, *KERNEL)
+    yield tmp_path / "kernels-new"
+    compilation._start.cache_clear()
+
+
+def test_what_is_complete_is_used_unless_it_is_not_wanted(empty: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not kernels.ready()
+    assert compilation.compile_all()
+    assert kernels.ready()
+    monkeypatch.setenv("PNU_FAST", "0")
+    assert not kernels.ready()
+
+
+def test_a_failure_is_noted_and_said(empty: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compilation, "KERNELS", ("no_such_kernel",))
+    assert not compilation.compile_all()
+    assert not kernels.ready()
+    assert "no_such_kernel" in (compilation.reason() or "")
+    assert "no_such_kernel" in kernels_line(install=True)
+    monkeypatch.setattr(compilation, *KERNEL)
+    assert kernels_line(install=True) == "Compiled kernels are here.", "it is tried again where that is asked for"
+
+
+def test_the_doctor_compiles(empty: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "pnu doctor --install compiles them" in kernels_line(install=False)
+    assert kernels_line(install=True) == "Compiled kernels are here."
+    assert "about a minute" in capsys.readouterr().out
+
+
+@pytest.fixture
+def begun(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """Programs that were begun, in a process that is no test."""
+    programs: list[list[str]] = []
+    monkeypatch.setattr(subprocess, "Popen", lambda command, **options: programs.append(command))
+    for name in ("PYTEST_VERSION", "CI"):
+        monkeypatch.delenv(name, raising=False)
+    return programs
+
+
+def test_compiled_in_the_background_once(empty: Path, begun: list[list[str]]) -> None:
+    for _ in range(3):
+        compilation.compile_in_background()
+    assert begun == [[sys.executable, "-m", "pnu.kernels.compilation"]]
+
+
+@pytest.mark.parametrize("why", ["compiled", "failed", "PNU_FAST=0", "a test"])
+def test_nothing_is_compiled_in_the_background_where(
+    empty: Path, begun: list[list[str]], monkeypatch: pytest.MonkeyPatch, why: str
+) -> None:
+    if why in ("compiled", "failed"):
+        empty.mkdir()
+        (empty / (compilation.COMPLETE if why == "compiled" else compilation.FAILED)).touch()
+    else:
+        monkeypatch.setenv(*{"PNU_FAST=0": ("PNU_FAST", "0"), "a test": ("PYTEST_VERSION", "9")}[why])
+    compilation.compile_in_background()
+    assert begun == []
+
+
+def test_one_process_compiles(empty: Path) -> None:
+    empty.mkdir()
+    with open(empty / compilation.LOCK, "w") as lock:
+        assert compilation._taken(lock, wait=False)
+        assert not compilation.compile_all(wait=False)
+    assert compilation.compile_all(wait=False)
+
+
+def test_where_nothing_can_be_written_nothing_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert compilation.folder.__wrapped__() is None
+    for module in ("pnu.kernels.compilation", "pnu.commands.doctor"):
+        monkeypatch.setattr(f"{module}.folder", lambda: None)
+    assert not compilation.compile_all()
+    assert not kernels.ready()
+    compilation.compile_in_background()
+    assert "can be written" in kernels_line(install=True)
+
+
+def test_without_numba_nothing_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert compilation.folder.__wrapped__() is None
+    assert compilation.reason() == "numba is not installed"
+
+
+def test_another_source_has_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compilation, "HERE", tmp_path)
+    (tmp_path / "boxes.py").write_text("a = 1")
+    before = compilation._key()
+    assert compilation._key() == before
+    (tmp_path / "boxes.py").write_text("a = 2")
+    assert compilation._key() != before

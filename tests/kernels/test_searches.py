@@ -1,0 +1,99 @@
+"""Compiled searches against all distances: the k nearest points and farthest point sampling, bit by bit."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from pnu.geometry import sampling
+from pnu.geometry.point_tree import PointTree
+
+KINDS = ("random", "plane", "line", "equal", "repeated", "far", "lattice", "clusters")
+Points = np.ndarray
+
+
+def cloud(kind: str, n: int) -> Points:
+    """Points (n, 3) of a kind."""
+    points = np.random.default_rng(n).normal(size=(n, 3))
+    if kind in ("plane", "line"):
+        points[:, 2 if kind == "plane" else 1 :] = 0
+    if kind == "equal":
+        points[:] = points[0]
+    if kind == "repeated":
+        points = points[np.random.default_rng(1).integers(0, max(n // 5, 1), n)]
+    if kind == "far":
+        points = 0.01 * points + 1e6
+    if kind == "lattice":
+        points = np.round(3 * points)
+    if kind == "clusters":
+        points[: n // 2] *= 1e-6
+        points[0] = 1e5
+    return points
+
+
+def nearest(queries: Points, points: Points, k: int) -> tuple[Points, Points]:
+    """By all distances; of equal ones the lowest index first."""
+    x, y, z = (queries[:, None] - points).transpose(2, 0, 1)
+    dist_sq = x * x + y * y + z * z
+    idx = np.argsort(dist_sq, axis=1, kind="stable")[:, :k]
+    return np.take_along_axis(dist_sq, idx, 1), idx
+
+
+@pytest.mark.usefixtures("compiled")
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("n", "k"), [(1, 1), (5, 5), (17, 3), (129, 24), (1000, 1), (2000, 24), (700, 700)])
+def test_neighbors_are_those_of_all_distances(n: int, k: int, kind: str) -> None:
+    points = cloud(kind, n)
+    queries = np.concatenate([points[:150], points[:50] + 0.1 * cloud("random", min(n, 50)), [[7.0, 8.0, 9.0]]])
+    dist_sq, idx = PointTree(points).nearest_sq(queries, k)
+    expected, expected_idx = nearest(queries, points, k)
+    np.testing.assert_array_equal(dist_sq, expected)
+    if kind != "equal" or n < 500:
+        np.testing.assert_array_equal(idx, expected_idx)
+    assert all(len(set(row)) == k for row in idx)
+
+
+@pytest.mark.usefixtures("compiled")
+@pytest.mark.parametrize("kind", ["random", "lattice", "equal", "repeated"])
+def test_neighbors_depend_neither_on_the_order_of_queries_nor_on_threads(kind: str) -> None:
+    points, mixed = cloud(kind, 5000), np.random.default_rng(0).permutation(5000)
+    tree = PointTree(points)
+    dist, idx = tree.nearest(points, 9)
+    for number, found in ((1, tree.nearest(points[mixed], 9)), (3, tree.nearest(points[mixed], 9, threads=3))):
+        np.testing.assert_array_equal(found[0], dist[mixed], err_msg=f"{number} threads")
+        np.testing.assert_array_equal(found[1], idx[mixed], err_msg=f"{number} threads")
+
+
+def test_a_tree_without_kernels_finds_the_same(monkeypatch: pytest.MonkeyPatch, compiled: None) -> None:
+    points, queries = cloud("random", 3000), cloud("random", 400)
+    dist, idx = PointTree(points).nearest(queries, 16)
+    monkeypatch.setenv("PNU_FAST", "0")
+    plain = PointTree(points)
+    assert not plain.compiled
+    found, found_idx = plain.nearest(queries, 16)
+    np.testing.assert_allclose(found, dist, rtol=1e-14)
+    np.testing.assert_array_equal(found_idx, idx)
+
+
+@pytest.mark.usefixtures("compiled")
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("n", [1, 2, 63, 64, 65, 200, 2000])
+def test_farthest_points_are_those_of_plain_steps(monkeypatch: pytest.MonkeyPatch, n: int, kind: str) -> None:
+    points = cloud(kind, n).astype(np.float32)
+    for m in {1, max(n // 2, 1), n}:
+        found = sampling._farthest(points, m, n // 3)
+        np.testing.assert_array_equal(found, sampling._farthest_plain(points, m, n // 3))
+        assert len(set(found)) == m
+    monkeypatch.setattr(sampling, "NEAR_BLOCK", 50)
+    np.testing.assert_array_equal(
+        sampling._farthest_near(points, n // 2 + 1, 0), sampling._farthest(points, n // 2 + 1, 0)
+    )
+
+
+@pytest.mark.usefixtures("compiled")
+def test_farthest_points_of_several_threads() -> None:
+    clouds = [cloud("random", n).astype(np.float32) for n in (3000, 2000, 1000)]
+    with ThreadPoolExecutor(3) as pool:
+        found = list(pool.map(lambda points: sampling._farthest(points, 500, 0), clouds))
+    for points, idx in zip(clouds, found, strict=True):
+        np.testing.assert_array_equal(idx, sampling._farthest(points, 500, 0))
