@@ -6,11 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pnu.commands import _sides
+from pnu.commands import _filled, _sides
 from pnu.commands._entry import command, warn
 from pnu.config.quoting import shell_line
 from pnu.config.schema import doc
 from pnu.runtime.progress import busy, stages
+
+QUALITIES: dict[str, dict[str, float]] = {
+    "best": {},
+    "fast": {"seeds": 2, "candidates": 1.3, "shortlist": 1.0, "relaxation": 1, "refinements": 1},
+}  # how the surface network is used, see `pnu.networks.surface.Surface`
 
 
 @dataclass
@@ -25,6 +30,8 @@ class Scan:
     removed: str | None = doc("file for the points that were taken out; null: none is written")
     ratio: float = doc("points of the dense cloud for each point of the scan, any number >= 1")
     spacing: float | None = doc("instead of ratio: the distance wanted between points, in the scan's unit")
+    quality: str = doc("best; fast: about half the time, by fewer candidates and projections and a coarser octree")
+    holes: float | None = doc(_filled.HOLES)
     normals: str = doc(_sides.NORMALS)
     viewpoint: str | None = doc(_sides.VIEWPOINT)
     up: str | None = doc(_sides.UP)
@@ -54,8 +61,11 @@ def scan(cfg: Any) -> None:
     origin = "with normals" if before.normals is not None else "without normals"
     say(f"scan:   {cfg.input}, {len(before.points)} points, {origin}")
 
+    import torch
+
     from pnu import reconstruction
     from pnu.geometry.cloud_statistics import describe_cloud
+    from pnu.networks import checkpoints
     from pnu.upsamplers import whole_clouds
 
     wanted = cfg.ratio if cfg.spacing is None else whole_clouds.ratio_of_spacing(before.points, cfg.spacing)
@@ -67,14 +77,18 @@ def scan(cfg: Any) -> None:
     if cfg.removed is not None:
         gone = {name: values[stray] for name, values in before.attributes.items()}
         io.write_cloud(cfg.removed, before.points[stray], None, gone)
+    network = checkpoints.load(whole_clouds.weights_source("surface", own, lined))
+    for name, value in QUALITIES[cfg.quality].items():
+        setattr(network, name, value)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
     with stages(cfg.quiet) as progress:
         dense = whole_clouds.upsample(
             cloud.points, cloud.normals, ratio=count / len(cloud.points), outliers="keep", lines="keep", signs="keep",
-            model=whole_clouds.weights_source("surface", own, lined),
-            seed=cfg.seed, progress=progress,
+            model=network, device=device, holes=cfg.holes, seed=cfg.seed, progress=progress,
         )  # fmt: skip
     say(f"dense:  {len(dense)} points with unit normals, {time.perf_counter() - started:.1f} s")
-    depth = reconstruction.octree_depth(dense) if cfg.depth is None else cfg.depth
+    coarser = int(cfg.quality == "fast")
+    depth = reconstruction.octree_depth(dense) - coarser if cfg.depth is None else cfg.depth
     with busy(f"surface, depth {depth}", cfg.quiet):
         surface = reconstruction.reconstruct(
             dense[:, :3], dense[:, 3:], depth=depth, timeout=cfg.timeout, name=cfg.input
@@ -92,7 +106,10 @@ def scan(cfg: Any) -> None:
         of_points = cloud.attributes["colors"][:, :3]
         colors = {"colors": reconstruction.interpolated_values(cloud.points, of_points, mesh.vertices) / 255}
     if cfg.cloud is not None:
-        io.write_cloud(cfg.cloud, dense[:, :3], dense[:, 3:], whole_clouds.attributes(dense, cloud))
+        values, line = _filled.values_to_write(cfg, cfg.cloud, dense, cloud, count)
+        if line:
+            say(line)
+        io.write_cloud(cfg.cloud, dense[:, :3], dense[:, 3:], values)
         say(f"cloud:  {cfg.cloud}")
     notes = io.write_mesh(cfg.output, mesh, vertex_normals=vertex_normals(mesh), **colors)
     if cfg.page is not None:
@@ -114,6 +131,9 @@ def check_files(cfg: Any) -> None:
     _sides.check_sides(cfg)
     if not 1 <= cfg.ratio < float("inf"):
         raise ValueError(f"ratio={cfg.ratio:g}: expected a number >= 1, the points out for each point in")
+    _filled.check_holes(cfg)
+    if cfg.quality not in QUALITIES:
+        raise ValueError(f"quality={cfg.quality}: expected {' or '.join(QUALITIES)}")
     if cfg.reach is not None and not cfg.reach > 0:
         raise ValueError(f"reach={cfg.reach:g}: expected a number of spacings above 0, such as 4, or null")
     if Path(cfg.output).suffix.lower() not in MESH_OUTPUTS:

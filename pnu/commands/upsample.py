@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from pnu.commands import _sides
+from pnu.commands import _filled, _sides
 from pnu.commands._entry import command
 from pnu.config.quoting import shell_line
 from pnu.config.schema import doc
@@ -49,6 +49,7 @@ class Upsample:
     sample: int | None = doc("of a mesh: as many points on its faces, with their normals; null: its vertices")
     outliers: str = doc("auto: stray points, which lie off the surface, are taken out first; keep: all stay")
     lines: str = doc("auto: scan lines, dense along and sparse across, are thinned out first; keep: they stay")
+    holes: float | None = doc(_filled.HOLES)
     removed: str | None = doc("file for the points that were taken out; null: none is written")
     patch_size: int | None = doc("points of a patch, at least 16; null: what the network was made for")
     batch_size: int | None = doc("patches (surface: points) at once, bounds the memory; null: by the device")
@@ -68,6 +69,7 @@ def upsample(cfg: Any) -> None:
     _sides.check_sides(cfg)
     if not 1 <= cfg.ratio < float("inf"):  # here too: the network's libraries take seconds to load
         raise ValueError(f"ratio={cfg.ratio:g}: expected a number >= 1, the points out for each point in")
+    _filled.check_holes(cfg)
     io.check_output(cfg.output)
     if cfg.removed is not None:
         io.check_output(cfg.removed)
@@ -129,6 +131,7 @@ def upsample(cfg: Any) -> None:
             outliers="keep",
             lines="keep",
             signs="keep",
+            holes=cfg.holes,
             model=checkpoints.load(run, cfg.allow) if cfg.allow else run,
             patch_size=cfg.patch_size,
             device=cfg.device,
@@ -140,7 +143,10 @@ def upsample(cfg: Any) -> None:
         )
     kept = io.kept_attributes(cfg.output, cloud.attributes)
     held = cloud._replace(attributes={name: cloud.attributes[name] for name in kept})
-    notes = io.write_cloud(cfg.output, dense[:, :3], dense[:, 3:], whole_clouds.attributes(dense, held))
+    values, line = _filled.values_to_write(cfg, cfg.output, dense, held, count)
+    if line:
+        say(line)
+    notes = io.write_cloud(cfg.output, dense[:, :3], dense[:, 3:], values)
     if parts is not None:
         shutil.rmtree(parts, ignore_errors=True)
     for told, names in (("carried over", kept), ("left out", [name for name in cloud.attributes if name not in kept])):

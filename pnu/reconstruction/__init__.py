@@ -1,5 +1,6 @@
 """Surfaces from points with normals, and how far they lie from the true ones."""
 
+from pnu.reconstruction.hole_filling import fill_holes
 from pnu.reconstruction.screened_poisson import (
     ReconstructedSurface,
     cut_off,
@@ -15,6 +16,7 @@ __all__ = [
     "SurfaceErrors",
     "check_frame",
     "cut_off",
+    "fill_holes",
     "interpolated_values",
     "octree_depth",
     "reconstruct",

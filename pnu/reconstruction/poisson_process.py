@@ -23,7 +23,7 @@ def main(source: str, target: str) -> None:
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(given["points"]))
     cloud.normals = open3d.utility.Vector3dVector(given["normals"])
     mesh, density = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
-        cloud, depth=int(given["depth"]), linear_fit=True, n_threads=1
+        cloud, depth=int(given["depth"]), scale=float(given["box"]), linear_fit=True, n_threads=1
     )
     np.savez(target, vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.triangles), density=np.asarray(density))
 

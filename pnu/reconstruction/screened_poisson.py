@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 SHALLOWEST, DEEPEST = 4, 11  # what is chosen by itself
 FAR = 3.0  # in spacings: a point, or a piece of surface, that far from any other stands alone
-BOX = 1.1  # side of Open3D's octree over that of the points' bounding box
+BOX = 1.1  # side of the octree over that of the points' bounding box
 
 
 class ReconstructedSurface(NamedTuple):
@@ -59,14 +59,16 @@ class ReconstructedSurface(NamedTuple):
 
 
 def reconstruct(
-    points: np.ndarray, normals: np.ndarray, *, depth: int | None = None, timeout: float = 600, name: str = "cloud"
-) -> ReconstructedSurface:
+    points: np.ndarray, normals: np.ndarray, *, depth: int | None = None, box: float = BOX, timeout: float = 600,
+    name: str = "cloud",
+) -> ReconstructedSurface:  # fmt: skip
     """The surface through points `(n, 3)` along normals `(n, 3)`; those of no length are estimated. In their frame.
 
     The work is done by a child process, which may crash or hang without loss. The same input gives the same mesh.
 
     Args:
         depth: of the octree, one more halves its cells; default: cells of half the points' spacing.
+        box: side of the octree over that of the points' bounding box: beyond it there is no surface.
         timeout: seconds.
         name: of the cloud in messages.
 
@@ -79,9 +81,9 @@ def reconstruct(
     if depth is not None and not 1 <= depth <= 16:
         raise ValueError(f"depth={depth}: expected 1 to 16, 8 is usual")
     given = complete_normals(torch.from_numpy(points), torch.from_numpy(given)).numpy()
-    depth = octree_depth(points) if depth is None else depth
+    depth = octree_depth(points, box) if depth is None else depth
     center, radius = (points.min(0) + points.max(0)) / 2, np.ptp(points, axis=0).max() / 2
-    found = run_child((points - center) / radius, given, depth, timeout)
+    found = run_child((points - center) / radius, given, depth, timeout, box)
     mesh = Mesh(found["vertices"] * radius + center, found["faces"].astype(np.int64))
     if not len(mesh.faces):
         raise ValueError(f"{name}: Poisson reconstruction found no surface; normals that contradict each other do that")
@@ -97,17 +99,17 @@ def reconstruct(
     return ReconstructedSurface(mesh, found["density"], depth, inside_out, *shares)
 
 
-def octree_depth(points: np.ndarray) -> int:
+def octree_depth(points: np.ndarray, box: float = BOX) -> int:
     """Depth at which an octree cell is at most half the points' spacing, within 4..11."""
-    cells = BOX * np.ptp(points, axis=0).max() / spacing(points)
+    cells = box * np.ptp(points, axis=0).max() / spacing(points)
     return int(np.clip(np.ceil(np.log2(cells)) + 1, SHALLOWEST, DEEPEST))
 
 
-def run_child(points: Array, normals: Array, depth: int, timeout: float) -> dict[str, np.ndarray]:
+def run_child(points: Array, normals: Array, depth: int, timeout: float, box: float = BOX) -> dict[str, np.ndarray]:
     """The surface that a process of its own makes; `ValueError` where it crashes or takes too long."""
     with tempfile.TemporaryDirectory(prefix="pnu-") as folder:
         source, target = Path(folder, "cloud.npz"), Path(folder, "mesh.npz")
-        np.savez(source, points=points, normals=normals, depth=depth)
+        np.savez(source, points=points, normals=normals, depth=depth, box=box)
         command = [sys.executable, "-I", poisson_process.__file__, str(source), str(target)]
         try:
             run = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace", timeout=timeout)

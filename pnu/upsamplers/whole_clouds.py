@@ -25,6 +25,7 @@ from pnu.geometry.unit_sphere import Frame, unit_sphere_frame
 from pnu.io import Cloud, check_cloud
 from pnu.io.sensor import asked_sight
 from pnu.networks import checkpoints
+from pnu.reconstruction import fill_holes
 from pnu.runtime.parts import Parts
 from pnu.runtime.progress import Progress, silent
 from pnu.runtime.workers import Processes
@@ -50,6 +51,7 @@ def upsample(
     outliers: Treatment = "auto",
     lines: Treatment = "auto",
     signs: Treatment = "auto",
+    holes: float | None = None,
     device: str = "auto",
     devices: int = 1,
     batch_size: int | None = None,
@@ -83,6 +85,8 @@ def upsample(
         lines: "auto": scan lines, dense along and sparse across, are thinned out first; "keep": they stay.
         signs: "auto": where given normals contradict each other, their axes are kept and their sides chosen anew;
             "keep": they are taken as they are.
+        holes: radius, in the unit of the points, up to which holes are filled, by points beyond round(ratio n) that
+            continue the surface smoothly (`pnu.reconstruction.fill_holes`); None: none is.
         device: "auto" (where the given network is; else CUDA where there is one), "cpu", "cuda", "cuda:1" ...
         devices: CUDA devices, or processes on the CPU, that share the work of the network; the result is the same for
             any number. More than one needs `if __name__ == "__main__":` in a script.
@@ -93,7 +97,8 @@ def upsample(
         parts: folder for finished parts of a long computation; the same call goes on from them after an interruption.
 
     Returns:
-        (round(ratio n), 6) float64: points in the frame and unit of the input, and unit normals.
+        (round(ratio n), 6) float64: points in the frame and unit of the input, and unit normals; with `holes` those
+        that fill them after these.
 
     Raises:
         ValueError: in one line, which argument is wrong and what was expected.
@@ -120,6 +125,8 @@ def upsample(
     for name, value, least in sizes:
         if value is not None and not (isinstance(value, Integral) and value >= least):
             raise ValueError(f"{name}={value}: expected a whole number >= {least}")
+    if holes is not None and not (isinstance(holes, Real) and 0 < holes < float("inf")):
+        raise ValueError(f"holes={_short(holes)}: expected a radius above 0 in the unit of the points")
     if density not in DENSITIES:
         raise ValueError(f"density={density}: expected {', '.join(DENSITIES)}")
     if keep not in (True, False, "auto"):
@@ -151,7 +158,13 @@ def upsample(
         raw = upsampler.upsample_cloud(sparse.to(target), count, context)
         dense = with_unit_normals(raw.cpu().double(), sparse)
     found = frame.from_unit(dense[None])[0].numpy()
-    return _measured_first(found, dense, sparse, given) if keeps else found
+    if keeps:
+        found = _measured_first(found, dense, sparse, given)
+    if holes is not None:
+        progress("holes", 0, 1)
+        found = np.vstack([found, fill_holes(found, holes)])
+        progress("holes", 1, 1)
+    return found
 
 
 def _measured_first(found: np.ndarray, unit: Tensor, sparse: Tensor, given: Cloud) -> np.ndarray:
@@ -178,6 +191,13 @@ def attributes(dense: np.ndarray, cloud: Cloud) -> dict[str, np.ndarray]:
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     sparse = np.hstack([cloud.points, normals / np.maximum(length, 1e-300)])
     return {name: carry(dense, sparse, values) for name, values in cloud.attributes.items()}
+
+
+def attributes_with_filled(dense: np.ndarray, cloud: Cloud, count: int) -> dict[str, np.ndarray]:
+    """`attributes`, and which of the points (m, 6) fill holes, those after the first `count`: 1, else 0."""
+    found = attributes(dense, cloud)
+    before = found.get("filled", np.zeros(len(dense)))
+    return found | {"filled": np.where(np.arange(len(dense)) >= count, 1, before).astype(np.uint8)}
 
 
 def ratio_of_spacing(points: np.ndarray, spacing: float) -> float:

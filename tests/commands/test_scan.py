@@ -57,6 +57,8 @@ def test_what_is_wrong_is_said_before_the_work(place: Path, capsys: pytest.Captu
         "output=scan.ply": "output=scan.ply: is the input; give another name",
         "output=mesh.ply cloud=mesh.ply": "cloud=mesh.ply: is the output; give another name",
         "output=mesh.ply page=page.txt": "page=page.txt: expected a name that ends in .html",
+        "output=mesh.ply quality=good": "quality=good: expected best or fast",
+        "output=mesh.ply holes=0": "holes=0: expected a radius above 0",
         "output=mesh.ply reach=-1": "reach=-1: expected a number of spacings above 0",
         "output=mesh.ply ratio=0.5": "ratio=0.5: expected a number >= 1",
     }
@@ -83,3 +85,39 @@ def test_a_surface_is_cut_off_where_its_points_end() -> None:
         reconstruction.cut_off(surface, points + 100, 1)
     with pytest.raises(ValueError, match="reach=0: expected"):
         reconstruction.cut_off(surface, points, 0)
+
+
+def test_fast_finds_the_same_surface(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    clouds = []
+    for quality in ("best", "fast"):
+        main(["input=scan.ply", "output=mesh.ply", "cloud=dense.ply", f"quality={quality}", "quiet=true"])
+        clouds.append(read_cloud("dense.ply").points)
+        assert np.abs(np.linalg.norm(read_mesh("mesh.ply").vertices, axis=1) - 1).mean() < 0.03
+    assert len(clouds[0]) == len(clouds[1])
+    assert not (clouds[0] == clouds[1]).all()
+    assert np.abs(np.linalg.norm(clouds[1], axis=1) - 1).mean() < 0.01
+    assert capsys.readouterr().out == ""
+
+
+def test_a_hole_is_closed_on_request(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points = bowl(2000)
+    write_cloud("scan.ply", points[np.linalg.norm(points - [0, 0, -1], axis=1) > 0.4])
+    nearest = []  # vertex to the middle of the hole
+    for holes in ("null", "0.6"):
+        main(
+            [
+                "input=scan.ply",
+                "output=mesh.ply",
+                "ratio=2",
+                "quality=fast",
+                "reach=2",
+                f"holes={holes}",
+                "cloud=dense.ply",
+            ]
+        )
+        nearest.append(np.linalg.norm(read_mesh("mesh.ply").vertices - [0, 0, -1], axis=1).min())
+    assert nearest[0] > 0.1
+    assert nearest[1] < 0.05
+    dense = read_cloud("dense.ply")
+    assert dense.points[dense.attributes["filled"] == 1, 2].max() < -0.75
+    assert "points fill them, flagged by filled" in capsys.readouterr().out

@@ -245,3 +245,26 @@ def test_what_was_left_out_while_reading_is_said(place: Path) -> None:
     assert "1620 of 1800 points left out: at the place of another" in done.stdout
     assert "5 of 180 normals are zero or NaN: theirs are estimated" in done.stdout
     assert len(read_cloud(place / "dense.ply").points) == 360
+
+
+def test_holes_are_filled_and_flagged(tmp_path: Path) -> None:
+    i = np.arange(1500) + 0.5
+    z, angle = 1 - 2 * i / 1500, np.pi * (1 + np.sqrt(5)) * i
+    points = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], 1)[60:]
+    write_cloud(tmp_path / "cloud.ply", points, points, {"intensity": z[60:]})
+    line = ("input=cloud.ply", "ratio=1", "keep=true", "outliers=keep", "holes=0.6")
+    done = ran(main, tmp_path, *line, "output=closed.ply")
+    assert done.returncode == 0, done.stderr
+    closed = read_cloud(tmp_path / "closed.ply")
+    filled = closed.attributes["filled"] == 1
+    np.testing.assert_allclose(closed.points[:1440], points, atol=1e-6)
+    assert not filled[:1440].any()
+    assert filled[1440:].all()
+    assert 30 < filled.sum() < 90  # 60 were taken out
+    assert closed.points[filled, 2].min() > 0.9
+    assert f"holes:  {filled.sum()} points fill them, flagged by filled\n" in done.stdout
+    done = ran(main, tmp_path, *line, "output=closed.xyz")
+    assert "points fill them, the last ones; this format has no room for a flag\n" in done.stdout
+    done = ran(main, tmp_path, *line[:-1], "holes=-1", "output=open.ply")
+    assert done.stderr == "error: holes=-1: expected a radius above 0 in the unit of the points\n"
+    assert not (tmp_path / "open.ply").exists()
