@@ -11,21 +11,28 @@ other dipoles. Related: parametric Gauss reconstruction (Lin et al. 2022), windi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
 
+from pnu import kernels
 from pnu.geometry.neighbor_search import knn, nearest
 from pnu.geometry.sampling import farthest_points_large
+from pnu.runtime import threads
 
 ANCHORS = 4096  # points whose dipoles all see each other: 64 MiB a matrix
-ROWS = 2**16  # points treated at once in local steps
+ROWS = 2**16  # points treated at once in local steps,
+CHUNK = 2**11  # or so many by a thread
+BLOCK = 128  # rows of a matrix of all pairs, few enough for a processor's cache
 OPEN = 0.6  # relative misfit of Gauss' law; closed shapes stay below 0.5, a hemisphere too
 SOME_NOISE = 0.1  # in spacings, where it is not known
+Array = NDArray[np.float32]
 
 
 class NeighborCloud(NamedTuple):
@@ -69,13 +76,13 @@ def is_closed(cloud: NeighborCloud, normals: Tensor) -> bool:
         chosen = torch.from_numpy(farthest_points_large(cloud.points, ANCHORS)).to(normals.device)
         cloud, normals = NeighborCloud.of(cloud.points[chosen]), normals[chosen]
     weight = cloud.area.sqrt()
-    winding = torch.cat([_layer(cloud, normals, rows) @ cloud.area for rows in _blocks(normals)])
+    winding = _layers(cloud, normals, torch.ones_like(weight)) @ cloud.area
     return bool(((winding.abs() - 0.5) * weight).norm() <= OPEN * (0.5 * weight).norm())
 
 
 def _global_signs(cloud: NeighborCloud, lines: Tensor) -> Tensor:
     weight = cloud.area.sqrt()
-    layer = torch.cat([_layer(cloud, lines, rows) for rows in _blocks(lines)]).mul_(weight).mul_(weight[:, None])
+    layer = _layers(cloud, lines, weight)
     areas = _least_squares(layer, 0.5 * weight, 4)
 
     def misfit(sign: Tensor) -> float:
@@ -119,8 +126,33 @@ def _sign(values: Tensor) -> Tensor:
 
 
 def _blocks(lines: Tensor) -> tuple[Tensor, ...]:
-    """Rows of a matrix of all pairs, few enough for a processor's cache."""
-    return torch.split(torch.arange(len(lines), device=lines.device), 128)
+    """Rows of a matrix of all pairs, block by block."""
+    return torch.split(torch.arange(len(lines), device=lines.device), BLOCK)
+
+
+def _layers(cloud: NeighborCloud, lines: Tensor, scale: Tensor) -> Tensor:
+    """Winding number at each point of unit area at each point, times the factors (n,) of both: (n, n)."""
+    if _compiled(cloud):
+        from pnu.kernels.dipoles import winding_rows
+
+        return _all_pairs(winding_rows, cloud, lines, cloud.spacing, scale)
+    return torch.cat([_layer(cloud, lines, rows) for rows in _blocks(lines)]).mul_(scale).mul_(scale[:, None])
+
+
+def _compiled(cloud: NeighborCloud) -> bool:
+    return cloud.points.device.type == "cpu" and kernels.ready()
+
+
+def _all_pairs(
+    rows_of: Callable[[Array, int, Array], None], cloud: NeighborCloud, lines: Tensor, widths: Tensor, scale: Tensor
+) -> Tensor:
+    """A matrix (n, n) whose rows a kernel computes, on all threads."""
+    from pnu.kernels.dipoles import as_sources
+
+    sources = as_sources(*(values.numpy() for values in (cloud.points, lines, widths, scale)))
+    matrix = np.empty((len(lines), len(lines)), np.float32)
+    threads.map_on_threads(lambda i: rows_of(sources, i, matrix[i : i + BLOCK]), range(0, len(lines), BLOCK))
+    return torch.from_numpy(matrix)
 
 
 def _layer(cloud: NeighborCloud, lines: Tensor, rows: Tensor) -> Tensor:
@@ -132,6 +164,10 @@ def _layer(cloud: NeighborCloud, lines: Tensor, rows: Tensor) -> Tensor:
 
 def _dipoles(cloud: NeighborCloud, lines: Tensor, width: float) -> Tensor:
     """Field at each point, along its line, of each point's dipole, times both areas: (n, n), symmetric."""
+    if _compiled(cloud):
+        from pnu.kernels.dipoles import dipole_rows
+
+        return _all_pairs(dipole_rows, cloud, lines, width * cloud.spacing, cloud.area)
     points, height = cloud.points, (cloud.points * lines).sum(1)
     blocks = []
     for rows in _blocks(lines):
@@ -200,6 +236,8 @@ def _spread(cloud: NeighborCloud, lines: Tensor, anchors: Tensor, sign: Tensor) 
 def field(cloud: NeighborCloud, normals: Tensor, noise: float) -> Tensor:
     """Minus the gradient of the neighbors' winding number at each point, as unit vectors (n, 3)."""
     width = 1 + 3 * noise
+    if _compiled(cloud):
+        return _compiled_field(cloud, normals, width)
     out = []
     for rows in torch.split(torch.arange(len(normals), device=normals.device), ROWS):
         idx = cloud.idx[rows, 1:]
@@ -210,3 +248,14 @@ def field(cloud: NeighborCloud, normals: Tensor, noise: float) -> Tensor:
         dipoles = (normals[idx] - 3 * along / dist_sq * offset) * cloud.area[idx][..., None] / dist_sq**1.5
         out.append(torch.nn.functional.normalize(dipoles.sum(1), dim=1))
     return torch.cat(out)
+
+
+def _compiled_field(cloud: NeighborCloud, normals: Tensor, width: float) -> Tensor:
+    from pnu.kernels.dipoles import as_sources, neighbor_field
+
+    values = (cloud.points, normals.float(), width * cloud.spacing, cloud.area)
+    sources = np.ascontiguousarray(as_sources(*(value.numpy() for value in values)).T)
+    idx, found = cloud.idx.contiguous().numpy(), np.empty((len(normals), 3), np.float32)
+    parts = range(0, len(found), CHUNK)
+    threads.map_on_threads(lambda i: neighbor_field(sources, idx, i, found[i : i + CHUNK]), parts)
+    return torch.from_numpy(found).to(normals)

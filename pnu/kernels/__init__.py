@@ -9,6 +9,7 @@ missing, `PNU_FAST=0` is set, or the kernels are not compiled yet (`pnu.kernels.
 | `vectors`, `tiles` | several float32 at once, and matrix products made of them |
 | `boxes` | a cloud in the order of a tree of boxes, on which the next two search |
 | `neighbors`, `greedy_sampling` | the k nearest points, and farthest point sampling |
+| `dipoles` | winding numbers and fields, from which orientation comes |
 | `frames`, `projector` | the surface model: local frames and spheres; the network on them |
 """
 
