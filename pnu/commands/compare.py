@@ -24,8 +24,8 @@ class Compare:
 
     commas: ClassVar = ("columns",)
     methods: list[str] = doc(
-        "run folders, folders of a sweep, weights, and apss, poisson, midpoint, open3d (its usual chain); "
-        "NAME:FOLDER gives a run another name"
+        "run folders, folders of a sweep, weights, and apss, poisson, midpoint, lop, wlop, ear, l0, open3d (its usual "
+        "chain); NAME:FOLDER gives a run another name"
     )
     data: Group = doc(
         "Shapes: procedural, or of data=meshes data.root=FOLDER: meshes, pairs in clouds/ truth/ or input_N/ gt_N/"

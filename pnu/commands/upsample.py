@@ -29,7 +29,10 @@ class Upsample:
         "file to read: ply, text (xyz, csv, pts ...), pcd, las, laz, e57, npy, npz; of a mesh its vertices"
     )
     output: str = doc("file to write; its suffix says the format")
-    run: str = doc("run folder, or weights that come with pnu: surface, pnu ...; newest: the run that finished last")
+    run: str = doc(
+        "run folder, weights that come with pnu (surface, pnu ...), or no network: apss, poisson, midpoint, ear; lop, "
+        "wlop and l0 denoise, then take midpoints; newest: the run that finished last"
+    )
     ratio: float = doc("points out for each point in, any number >= 1")
     spacing: float | None = doc("instead of ratio: the distance wanted between points, in the cloud's unit")
     density: str = doc(
@@ -89,7 +92,7 @@ def upsample(cfg: Any) -> None:
     from pnu.geometry.cloud_statistics import describe_cloud
     from pnu.networks import checkpoints
     from pnu.networks.checkpoints import NEWEST
-    from pnu.upsamplers import whole_clouds
+    from pnu.upsamplers import CLASSICAL, whole_clouds
 
     wanted = cfg.ratio if cfg.spacing is None else whole_clouds.ratio_of_spacing(cloud.points, cfg.spacing)
     count, before = whole_clouds.output_count(len(cloud.points), wanted), cloud
@@ -132,7 +135,7 @@ def upsample(cfg: Any) -> None:
             lines="keep",
             signs="keep",
             holes=cfg.holes,
-            model=checkpoints.load(run, cfg.allow) if cfg.allow else run,
+            model=checkpoints.load(run, cfg.allow) if cfg.allow and run not in CLASSICAL else run,
             patch_size=cfg.patch_size,
             device=cfg.device,
             devices=cfg.devices,

@@ -6,18 +6,30 @@ import torch
 from torch import Tensor
 
 from pnu.upsamplers.context import Context, Upsampler
+from pnu.upsamplers.ear import EAR
+from pnu.upsamplers.l0 import L0
+from pnu.upsamplers.lop import LOP
 from pnu.upsamplers.midpoints import Midpoint
 from pnu.upsamplers.patches import Patches
 from pnu.upsamplers.point_set_surface import APSS
 from pnu.upsamplers.poisson_samples import PoissonSurface
 from pnu.upsamplers.surface_projection import SurfaceProjection
+from pnu.upsamplers.wlop import WLOP
 
-CLASSICAL: dict[str, type[Upsampler]] = {"apss": APSS, "poisson": PoissonSurface, "midpoint": Midpoint}
+CLASSICAL: dict[str, type[Upsampler]] = {
+    "apss": APSS,
+    "poisson": PoissonSurface,
+    "midpoint": Midpoint,
+    "lop": LOP,
+    "wlop": WLOP,
+    "ear": EAR,
+    "l0": L0,
+}
 """Upsamplers without training, by name."""
 
 
 def classical(name: str) -> Upsampler:
-    """An upsampler without training by name: apss, poisson or midpoint."""
+    """An upsampler without training by its name in `CLASSICAL`."""
     if name not in CLASSICAL:
         raise ValueError(f"method={name}: expected one of {', '.join(CLASSICAL)}")
     return CLASSICAL[name]()
