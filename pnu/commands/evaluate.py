@@ -28,7 +28,7 @@ class Evaluate:
         "run folder, or name or file of weights; newest: the run that finished last; null: `method`, or surface"
     )
     method: str | None = doc(
-        "upsampler without training instead of a run: apss, poisson, midpoint, lop, wlop, ear, l0, or open3d, its usual chain"
+        "upsampler without training instead of a run: apss, poisson, midpoint, lop, wlop, ear, l0, open3d (its chain)"
     )
     data: Group = doc(
         "Shapes: procedural, or of data=meshes data.root=FOLDER: meshes, pairs in clouds/ truth/ or input_N/ gt_N/"
