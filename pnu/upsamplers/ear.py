@@ -5,11 +5,13 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pnu.geometry.noise_level import noise_level
 from pnu.geometry.pair_weights import Within, theta, within
 from pnu.geometry.spacing import spacing
 from pnu.upsamplers.context import Context
 
 GROWTH = 3  # one point in so many wants a new one more than all the others do, in one round
+TURNS, NOISY = 2, 0.15  # turns where noise is more than this share of the spacing
 OPPOSED = -0.7  # cosine below which two points are on the two sides of a sheet, and nothing is between them
 
 
@@ -22,12 +24,12 @@ class EAR:
         angle: sigma_n, degrees between normals from which on a neighbor counts little.
         sensitivity: rho, how much more often points are inserted where normals differ; 0: for density alone.
         radius: h, reach of all weights, in spacings of the cloud.
-        normal_turns: of the smoothing of normals.
-        turns: of the resampling; 0: the input's points stay where they are.
+        turns: of the smoothing of normals and of the resampling; 0: the input's points stay where they are; None: 2
+            where the cloud shows noise, else 0.
     """
 
     def __init__(
-        self, angle: float = 15.0, sensitivity: float = 1.0, radius: float = 6.0, normal_turns: int = 3, turns: int = 5
+        self, angle: float = 25.0, sensitivity: float = 0.0, radius: float = 4.0, turns: int | None = None
     ) -> None:
         if not 0 < angle < 90:
             raise ValueError(f"angle={angle}: expected degrees between 0 and 90")
@@ -35,22 +37,24 @@ class EAR:
             raise ValueError(f"sensitivity={sensitivity}: expected a number from 0 to 10")
         if not 0 < radius < float("inf"):
             raise ValueError(f"radius={radius}: expected a number of spacings > 0")
-        if min(normal_turns, turns) < 0:
-            raise ValueError(f"normal_turns={normal_turns}, turns={turns}: expected at least 0")
-        self.angle, self.sensitivity, self.radius = angle, sensitivity, radius
-        self.normal_turns, self.turns = normal_turns, turns
+        if turns is not None and turns < 0:
+            raise ValueError(f"turns={turns}: expected at least 0")
+        self.angle, self.sensitivity, self.radius, self.turns = angle, sensitivity, radius, turns
 
     def upsample_cloud(self, cloud: Tensor, count: int, context: Context) -> Tensor:
         """cloud (n, 6) -> (count, 6): n resampled points, then the inserted ones in their order."""
         array = cloud.cpu().double().numpy()
         points, normals = array[:, :3], array[:, 3:]
-        radius = self.radius * spacing(points)
-        for turn in range(self.normal_turns):
-            context.progress("bilateral normals", turn, self.normal_turns)
+        apart = spacing(points)
+        radius, turns = self.radius * apart, self.turns
+        if turns is None:
+            turns = TURNS if noise_level(cloud[:, :3], cloud[:, 3:]) > NOISY * apart else 0
+        for turn in range(turns):
+            context.progress("bilateral normals", turn, turns)
             normals = bilateral_normals(points, normals, radius, self.angle)
         moved = points
-        for turn in range(self.turns):
-            context.progress("resampling away from edges", turn, self.turns)
+        for turn in range(turns):
+            context.progress("resampling away from edges", turn, turns)
             moved = resampled(moved, normals, points, radius, first=turn == 0)
             normals = bilateral_normals(moved, normals, radius, self.angle)
         context.progress("resampling away from edges", 1, 1)
@@ -118,8 +122,9 @@ def inserted(
     return np.vstack([points, new]), np.vstack([normals, directions])
 
 
-def neighbor_pairs(tree: cKDTree, k: int = 8) -> np.ndarray:
-    """Each two of which one is among the k nearest of the other, once: (e, 2)."""
+def neighbor_pairs(tree: cKDTree, k: int = 24) -> np.ndarray:
+    """Each two of which one is among the k nearest of the other, once, (e, 2): enough to reach over the gaps of random
+    points."""
     near = tree.query(tree.data, k=min(k + 1, tree.n))[1]
     here, there = np.repeat(np.arange(tree.n), near.shape[1]), near.ravel()
     numbers = np.unique((np.minimum(here, there) * tree.n + np.maximum(here, there))[here != there])
