@@ -20,6 +20,8 @@ MANY = 0.0035  # of the points is sure; noise of 1 % of the radius stays below
 ROUNDS = 3  # a stray point hides another
 PIECE = 12  # points below which a piece that stands apart is stray
 APART = 6.0  # usual spacings between a piece and all others
+EVEN = 0.45  # breadth of the middle 80 % of nearest distances over their median, below which points keep a distance
+FITS = (0.6, 1.6)  # nearest distances over those around, of points that fit into such an order
 FEWEST = 64  # points of a cloud in which strays can be told
 
 
@@ -48,7 +50,7 @@ def stray_points(points: NDArray[np.float64]) -> NDArray[np.bool_]:
             odds = detector()(torch.from_numpy(outlier_features(points[rows]))).numpy()
         if (odds > SURE).mean() > MANY:
             enough = LIKELY
-        stray = odds > enough
+        stray = (odds > enough) & ~fit_in_order(points[rows])
         stays[rows[stray]] = False
         if not stray.any():
             break
@@ -56,6 +58,21 @@ def stray_points(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     if len(rows) >= FEWEST:
         stays[rows[small_pieces(points[rows])]] = False
     return ~stays
+
+
+def fit_in_order(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which of evenly spread points (n, 3) have their nearest one as far away as others around, (n,); else none.
+
+    On tips and rods the points of such a cloud stand alone, but in order; what measures nothing would lie anyhow.
+    """
+    distance, near = cKDTree(points).query(points, 9)
+    apart = distance[:, 1]
+    narrow, usual, wide = np.quantile(apart, (0.1, 0.5, 0.9))
+    if wide - narrow >= EVEN * usual:
+        return np.zeros(len(points), bool)
+    share = apart / np.maximum(np.median(apart[near[:, 1:]], 1), 1e-300)
+    fits: NDArray[np.bool_] = (share > FITS[0]) & (share < FITS[1])
+    return fits
 
 
 def small_pieces(points: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -179,3 +179,13 @@ def test_normals_that_contradict_each_other_are_turned_their_axes_kept() -> None
     assert kept.normals is given
     dense = pnu.upsample(points, given, ratio=2)
     assert ((dense[:, :3] * dense[:, 3:]).sum(1) > 0.9).all()
+
+
+def test_tips_of_an_evenly_spread_cloud_stay() -> None:
+    rod = np.linspace(1.1, 3, 20)[:, None] * [0.0, 0, 1]  # a spike on a ball: a row of points in the ball's spacing
+    i = np.arange(1000) + 0.5
+    z, angle = 1 - i / 500, np.pi * (1 + np.sqrt(5)) * i
+    ball = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], 1)
+    assert not stray_points(np.vstack([ball, rod])).any()
+    alone = np.array([[1.3, 0, 0], [-1.5, 0.2, 0], [0, 0, -2.0], [0, 1.4, 0.3]])
+    np.testing.assert_array_equal(np.flatnonzero(stray_points(np.vstack([ball, rod, alone]))), np.arange(1020, 1024))
