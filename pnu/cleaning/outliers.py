@@ -8,9 +8,9 @@ import torch
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from pnu.geometry.outlier_features import outlier_features
+from pnu.geometry.point_tree import PointTree
 from pnu.networks.outlier_detector import OutlierDetector
 
 WEIGHTS = Path(__file__).with_name("outliers.safetensors")
@@ -78,7 +78,7 @@ def fit_in_order(points: NDArray[np.float64]) -> NDArray[np.bool_]:
 def small_pieces(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which of the points (n, 3) belong to a piece of fewer than 12 that stands apart from all others, (n,)."""
     k = min(PIECE, len(points) - 1)
-    distance, near = (found[:, 1:] for found in cKDTree(points).query(points, k + 1))
+    distance, near = PointTree(points).among_themselves(k + 1, threads=torch.get_num_threads())
     reach = APART * np.median(distance[near, min(5, k - 1)], 1)
     linked = distance <= np.maximum(reach[:, None], reach[near])
     first = np.broadcast_to(np.arange(len(points))[:, None], near.shape)[linked]

@@ -2,8 +2,8 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from pnu.geometry.point_tree import PointTree
 from pnu.geometry.sampling import farthest_points_large
 
 AROUND = 8  # neighbors whose spread is looked at
@@ -18,8 +18,8 @@ def evenness(points: NDArray[np.float64]) -> float:
 
     About 0.6 for the points (n, 3) of a surface, drawn at random or evenly; 0.1 and less on lines.
     """
-    tree = cKDTree(points)
-    near = points[tree.query(points[:: -(-len(points) // PLACES)], min(AROUND + 1, len(points)))[1]]
+    places = points[:: -(-len(points) // PLACES)]
+    near = points[PointTree(points).nearest(places, min(AROUND + 1, len(points)))[1]]
     near = near - near.mean(1, keepdims=True)
     size = np.sqrt(np.maximum(np.linalg.eigvalsh(near.transpose(0, 2, 1) @ near), 0))
     return float(np.median(size[:, 1] / np.maximum(size[:, 2], 1e-300)))
@@ -42,6 +42,6 @@ def thinned_lines(points: NDArray[np.float64]) -> NDArray[np.int64] | None:
 
 def averaged(points: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.float64]:
     """Points (m, 3) in place of those of the rows (m,): each the mean of all points (n, 3) that are nearest to it."""
-    owner = cKDTree(points[rows]).query(points)[1]
+    owner = PointTree(points[rows]).nearest(points, 1)[1][:, 0]
     total = np.stack([np.bincount(owner, axis, len(rows)) for axis in points.T], 1)
     return total / np.bincount(owner, minlength=len(rows))[:, None]

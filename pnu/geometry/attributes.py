@@ -1,7 +1,8 @@
 """Colors and other attributes of a cloud, carried over to points between its own."""
 
 import numpy as np
-from scipy.spatial import cKDTree
+
+from pnu.geometry.point_tree import PointTree
 
 NEIGHBORS = 6
 SAME_SIDE = 0.2  # cosine between normals below which a neighbor counts as another sheet's
@@ -15,7 +16,7 @@ def carry(dense: np.ndarray, sparse: np.ndarray, values: np.ndarray) -> np.ndarr
     where none does, the nearest. Whole numbers are rounded, other types (text, truth values) taken from the nearest.
     """
     k = min(2 * NEIGHBORS, len(sparse))
-    dist, idx = cKDTree(sparse[:, :3]).query(dense[:, :3], k=np.arange(1, k + 1))
+    dist, idx = PointTree(sparse[:, :3]).nearest(dense[:, :3], k)
     cosine = (dense[:, None, 3:] * sparse[idx, 3:6]).sum(-1)
     alike = cosine > SAME_SIDE
     if not (np.issubdtype(values.dtype, np.number) and not np.issubdtype(values.dtype, np.complexfloating)):

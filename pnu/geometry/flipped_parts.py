@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+
+from pnu.geometry.point_tree import PointTree
 
 PLACES = 10000  # points that are looked at
 NEIGHBORS = 10
@@ -57,7 +58,7 @@ def flipped_share(points: np.ndarray, normals: np.ndarray) -> float:
 
 def pairs_of(points: np.ndarray, normals: np.ndarray) -> Pairs:
     """The neighbors of points (n, 3) with unit normals (n, 3), and what these say of each pair."""
-    idx = cKDTree(points).query(points, k=NEIGHBORS + 1)[1][:, 1:]
+    idx = PointTree(points).among_themselves(NEIGHBORS + 1)[1]
     step = points[idx] - points[:, None]
     step /= np.maximum(np.linalg.norm(step, axis=2, keepdims=True), 1e-300)
     others = normals[idx]

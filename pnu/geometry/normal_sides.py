@@ -21,9 +21,9 @@ import numpy as np
 import torch
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
-from scipy.spatial import cKDTree
 
 from pnu.geometry.orientation import SOME_NOISE, NeighborCloud, field, is_closed, signs
+from pnu.geometry.point_tree import PointTree
 
 NEIGHBORS = 12
 CLEAR = 0.5  # cosine between an axis and the way to the sensor from which on signs may start there
@@ -52,7 +52,7 @@ class Couplings(NamedTuple):
     @staticmethod
     def of(points: np.ndarray, lines: np.ndarray) -> Couplings:
         """The pairs of points (n, 3) with unit lines (n, 3)."""
-        near = cKDTree(points).query(points, k=min(NEIGHBORS + 1, len(points)))[1][:, 1:]
+        near = PointTree(points).among_themselves(min(NEIGHBORS + 1, len(points)))[1]
         first, second = np.repeat(np.arange(len(near)), near.shape[1]), near.ravel()
         step = points[second] - points[first]
         step /= np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-300)
@@ -221,7 +221,7 @@ def _hidden(points: np.ndarray, lines: np.ndarray, viewpoint: np.ndarray) -> np.
     ray = points - viewpoint
     distance = np.linalg.norm(ray, axis=1)
     ray /= np.maximum(distance, 1e-300)[:, None]
-    spacing = cKDTree(points).query(points, k=min(6, len(points)))[0][:, 1:].mean(1)
+    spacing = PointTree(points).among_themselves(min(6, len(points)))[0].mean(1)
     angle = np.clip(COVERED * spacing / np.maximum(distance, 1e-300), 2.0**-16, 1)
     level = np.floor(-np.log2(angle)).astype(int)
     far_first = np.argsort(-distance, kind="stable")

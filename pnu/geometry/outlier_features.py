@@ -5,9 +5,15 @@ The ingredients are those of the usual removers of outliers, side by side: dista
 outlier factors (Breunig et al. 2000). All are free of place, rotation, size and density.
 """
 
+from collections.abc import Callable
+
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+
+from pnu import kernels
+from pnu.geometry.point_tree import PointTree
+from pnu.runtime import threads
 
 NEIGHBORS = 32
 RANKS = np.array([1, 2, 3, 4, 6, 8, 12, 16, 24, 32])  # whose distances are told
@@ -18,7 +24,8 @@ LISTS = (6, 12, 20, 32)  # lengths of the lists of nearest points in which a poi
 REACHES = (8, 20)  # neighbors of the local outlier factors
 LIMIT = 6.0  # of all features
 FEATURES = 52
-ROWS = 2**16  # points at once: bounds the memory
+ROWS = 2**16  # points at once: bounds the memory,
+CHUNK = 2**11  # or so many by a thread
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
@@ -26,27 +33,68 @@ Indices = NDArray[np.int64]
 def outlier_features(points: NDArray[np.float64]) -> NDArray[np.float32]:
     """Features (n, 52) of points (n, 3), n >= 3. Fewer than 33 points have their farthest neighbor several times."""
     k = min(NEIGHBORS, len(points) - 1)
-    distance, near = (found[:, 1:] for found in cKDTree(points).query(points, k + 1))
+    distance, near = PointTree(points).among_themselves(k + 1, threads=torch.get_num_threads())
     if k < NEIGHBORS:
-        distance, near = (np.pad(found, ((0, 0), (0, NEIGHBORS - k)), mode="edge") for found in (distance, near))
-    distance = np.maximum(distance, 1e-300)
+        missing = ((0, 0), (0, NEIGHBORS - k))
+        distance, near = np.pad(distance, missing, mode="edge"), np.pad(near, missing, mode="edge")
+    distance, near = np.maximum(distance, 1e-300), np.ascontiguousarray(near)
     spacing = distance[:, 5]
-    unit = np.median(spacing[near[:, :AROUND]], 1)
-    parts = [slice(first, first + ROWS) for first in range(0, len(points), ROWS)]
-    planes = [
-        np.concatenate(found) for found in zip(*(_planes(points, near[p], unit[p], p) for p in parts), strict=True)
-    ]
-    normals = planes[1]
+    unit = _quantiles(spacing, near, AROUND, (0.5,))[:, 0]
+    planes, normals = _planes_of_all(points, near, unit)
     columns = [
         np.log(distance[:, RANKS - 1] / unit[:, None]),
-        np.log(np.quantile(spacing[near], (0.1, 0.25, 0.75, 0.9), axis=1).T / unit[:, None]),
+        np.log(_quantiles(spacing, near, NEIGHBORS, (0.1, 0.25, 0.75, 0.9)) / unit[:, None]),
         *((np.bincount(near[:, :m].ravel(), minlength=len(points)) / m)[:, None] for m in LISTS),
-        planes[0],
-        np.concatenate([_among_fellows(points, normals, near[p], unit[p], p) for p in parts]),
+        planes,
+        _fellows_of_all(points, normals, near, unit),
         *(_outlier_factors(distance, near, m) for m in REACHES),
     ]
     features: NDArray[np.float32] = np.clip(np.nan_to_num(np.hstack(columns)), -LIMIT, LIMIT).astype(np.float32)
     return features
+
+
+def _on_threads(work: Callable[[slice], object], n: int) -> None:
+    parts = [slice(first, min(first + CHUNK, n)) for first in range(0, n, CHUNK)]
+    threads.map_on_threads(work, parts)
+
+
+def _quantiles(values: Floats, near: Indices, m: int, shares: tuple[float, ...]) -> Floats:
+    """Quantiles (n, shares) of the values (n,) at the first m neighbors of each point."""
+    if not kernels.ready():
+        return np.asarray(np.quantile(values[near[:, :m]], shares, axis=1).T)
+    from pnu.kernels.planes import neighbor_quantiles
+
+    values, found = np.ascontiguousarray(values), np.empty((len(near), len(shares)))
+    _on_threads(lambda p: neighbor_quantiles(values, near, m, np.array(shares), p.start, found[p]), len(near))
+    return found
+
+
+def _planes_of_all(points: Floats, near: Indices, unit: Floats) -> tuple[Floats, Floats]:
+    """`_planes` of all points."""
+    if not kernels.ready():
+        parts = [slice(first, first + ROWS) for first in range(0, len(points), ROWS)]
+        found = [_planes(points, near[p], unit[p], p) for p in parts]
+        return np.concatenate([planes for planes, _ in found]), np.concatenate([normals for _, normals in found])
+    from pnu.kernels.planes import PLANE, plane_features
+
+    points, unit = np.ascontiguousarray(points), np.ascontiguousarray(unit)
+    planes, normals = np.empty((len(points), PLANE * len(PLANES))), np.empty((len(points), 3))
+    counts = np.array(PLANES)
+    _on_threads(lambda p: plane_features(points, near, unit, counts, 1, p.start, planes[p], normals[p]), len(points))
+    return planes, normals
+
+
+def _fellows_of_all(points: Floats, normals: Floats, near: Indices, unit: Floats) -> Floats:
+    """`_among_fellows` of all points."""
+    if not kernels.ready():
+        parts = [slice(first, first + ROWS) for first in range(0, len(points), ROWS)]
+        return np.concatenate([_among_fellows(points, normals, near[p], unit[p], p) for p in parts])
+    from pnu.kernels.planes import FELLOW, fellow_features
+
+    points, normals, unit = (np.ascontiguousarray(values) for values in (points, normals, unit))
+    found, counts = np.empty((len(points), FELLOW * len(FELLOWS))), np.array(FELLOWS)
+    _on_threads(lambda p: fellow_features(points, normals, near, unit, counts, p.start, found[p]), len(points))
+    return found
 
 
 def _planes(points: Floats, near: Indices, unit: Floats, part: slice) -> tuple[Floats, Floats]:
@@ -84,4 +132,4 @@ def _outlier_factors(distance: Floats, near: Indices, m: int) -> Floats:
     """Logarithm of the local outlier factor with m neighbors, and its usual and high values around."""
     reach = np.maximum(distance[:, :m], distance[near[:, :m], m - 1]).mean(1)
     factor = np.log(reach * (1 / reach)[near[:, :m]].mean(1))
-    return np.column_stack([factor, np.quantile(factor[near[:, :m]], (0.5, 0.9), axis=1).T])
+    return np.column_stack([factor, _quantiles(factor, near, m, (0.5, 0.9))])

@@ -1,7 +1,8 @@
 """How dense a cloud is."""
 
 import numpy as np
-from scipy.spatial import cKDTree
+
+from pnu.geometry.point_tree import PointTree
 
 
 def spacing(points: np.ndarray, neighbors: int = 6) -> float:
@@ -11,12 +12,12 @@ def spacing(points: np.ndarray, neighbors: int = 6) -> float:
     samples of a surface give about the same.
     """
     points = points[:, :3]
-    far = cKDTree(points).query(points[:: -(-len(points) // 4000)], k=[min(neighbors + 1, len(points))])[0]
+    far = PointTree(points).nearest(points[:: -(-len(points) // 4000)], min(neighbors + 1, len(points)))[0][:, -1]
     return float(np.median(far) * np.sqrt(np.pi / neighbors))
 
 
 def local_spacing(points: np.ndarray, neighbors: int = 6) -> np.ndarray:
     """The same around each of the points `(n, >= 3)`: `(n,)`."""
     k = min(neighbors, len(points) - 1)
-    far = cKDTree(points[:, :3]).query(points[:, :3], k=[k + 1])[0][:, 0]
+    far = PointTree(points[:, :3]).among_themselves(k + 1)[0][:, -1]
     return np.asarray(far * np.sqrt(np.pi / k))

@@ -10,6 +10,7 @@ missing, `PNU_FAST=0` is set, or the kernels are not compiled yet (`pnu.kernels.
 | `boxes` | a cloud in the order of a tree of boxes, on which the next two search |
 | `neighbors`, `greedy_sampling` | the k nearest points, and farthest point sampling |
 | `dipoles` | winding numbers and fields, from which orientation comes |
+| `planes` | fits to neighborhoods, and what tells stray points by them |
 | `frames`, `projector` | the surface model: local frames and spheres; the network on them |
 """
 

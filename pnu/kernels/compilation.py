@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
-KERNELS = ("boxes", "neighbors", "greedy_sampling", "frames", "projector", "dipoles")
+KERNELS = ("boxes", "neighbors", "greedy_sampling", "frames", "projector", "dipoles", "planes")
 COMPLETE, LOCK, FAILED = "complete", "lock", "failed"
 EXACT = {"nnan", "ninf", "nsz"}  # results have the bits of NumPy's operations in the order written
 LOOSE = {"nnan", "ninf", "nsz", "arcp", "contract", "reassoc"}  # to rounding

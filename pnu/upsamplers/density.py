@@ -4,7 +4,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+
+from pnu.geometry.point_tree import PointTree
 
 Density = Literal["auto", "even", "follow"]
 DENSITIES = ("auto", "even", "follow")
@@ -18,7 +19,7 @@ STEP = 2**0.5  # between the spacings of two groups
 def point_areas(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Area of the surface that each of the points (n, 3) stands for, (n,), in their unit squared."""
     k, around = min(NEIGHBORS, len(points) - 1), min(AROUND, len(points))
-    distance, near = cKDTree(points).query(points, max(k + 1, around))
+    distance, near = PointTree(points).nearest(points, max(k + 1, around))
     areas: NDArray[np.float64] = np.pi / k * np.median(distance[:, k][near[:, :around]] ** 2, 1)
     areas[:] = np.maximum(areas, 1e-12 * areas.max())
     return areas
