@@ -65,7 +65,7 @@ def fit_in_order(points: NDArray[np.float64]) -> NDArray[np.bool_]:
 
     On tips and rods the points of such a cloud stand alone, but in order; what measures nothing would lie anyhow.
     """
-    distance, near = cKDTree(points).query(points, 9)
+    distance, near = PointTree(points).nearest(points, 9, threads=torch.get_num_threads())
     apart = distance[:, 1]
     narrow, usual, wide = np.quantile(apart, (0.1, 0.5, 0.9))
     if wide - narrow >= EVEN * usual:
