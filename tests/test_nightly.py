@@ -22,6 +22,7 @@ def test_fast(): assert False
 """
 
 
+@pytest.mark.slow
 def test_a_failure_does_not_end_it_and_is_told(tmp_path: Path) -> None:
     for name in ("test_soak.py", "test_other.py"):
         (tmp_path / name).write_text(CONTENT)

@@ -502,6 +502,7 @@ def test_command_warns_of_open_meshes_and_stops_at_other_frames(
     assert error.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_command_as_users_start_it(place: Path) -> None:
     command = [sys.executable, "-m", "pnu", "evaluate", "method=nearest"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)

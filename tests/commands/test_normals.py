@@ -2,8 +2,6 @@
 
 import importlib
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +12,7 @@ from pnu.geometry.mesh_sampling import signed_volume
 from pnu.io import read_cloud, read_mesh, write_cloud
 from pnu.io.sensor import sight_of
 from pnu.runtime.system_libraries import open3d_error
-from tests.refusals import refused
+from tests.refusals import ran, refused
 
 Array = np.ndarray
 RNG = np.random.default_rng(0)
@@ -43,8 +41,7 @@ def outward(name: str) -> float:
 
 
 def test_the_same_points_in_the_same_order_with_all_that_the_file_says(place: Path) -> None:
-    command = [sys.executable, "-m", "pnu", "normals", "input=mixed.ply", "output=out.ply"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = ran(main, place, "input=mixed.ply", "output=out.ply")
     assert done.returncode == 0, done.stderr
     before, after = read_cloud("mixed.ply"), read_cloud("out.ply")
     np.testing.assert_array_equal(after.points, before.points)

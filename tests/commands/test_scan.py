@@ -87,6 +87,7 @@ def test_a_surface_is_cut_off_where_its_points_end() -> None:
         reconstruction.cut_off(surface, points, 0)
 
 
+@pytest.mark.slow
 def test_fast_finds_the_same_surface(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     clouds = []
     for quality in ("best", "fast"):

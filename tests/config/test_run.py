@@ -15,6 +15,7 @@ from omegaconf import OmegaConf
 
 import pnu
 from pnu.commands._entry import command, renamed
+from pnu.commands.compare import Compare
 from pnu.commands.train import Train
 from pnu.config.compose import compose_config, composer, config_folder, flatten, variations
 from pnu.config.instantiate import instantiate
@@ -65,7 +66,7 @@ def test_a_key_without_documentation_would_be_found() -> None:
 def test_every_choice_of_a_group_composes(choice: str) -> None:
     group, _, name = choice.partition("=")
     try:
-        cfg = compose_config(Train, [choice], complete=False)
+        cfg = compose_config(Compare if group == "protocol" else Train, [choice], complete=False)
     except ValueError as error:
         pytest.fail(f"{choice}: {error}")
     if group in Train.__dataclass_fields__:

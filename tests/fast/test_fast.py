@@ -230,6 +230,7 @@ def _synchronized(rank: int, folder: str, x: Tensor, plainly: bool) -> None:
 
 
 @pytest.mark.parametrize("plainly", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_synchronized_batch_norm(plainly: bool, tmp_path: Path) -> None:
     """Two processes compute what one does with all rows, chunk by chunk or layer by layer."""
     x = torch.randn(150, 7, dtype=torch.float64)

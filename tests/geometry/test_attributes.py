@@ -57,6 +57,7 @@ def test_point_that_faces_no_neighbor_takes_the_nearest() -> None:
 
 
 @pytest.mark.parametrize("suffix", [".ply", pytest.param(".pcd", marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_colors_of_a_thin_sheet_reach_the_file(tmp_path, suffix: str) -> None:
     """Two sides a third of a spacing apart, red and blue, densified by the command itself."""
     sides = np.repeat([1.0, -1.0], 400)

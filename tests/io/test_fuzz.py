@@ -29,6 +29,7 @@ def test_thousands_of_cases(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("fault", ["os.abort()", "time.sleep(99)", "bytearray(2**31)", "print(1 / 0)"])
+@pytest.mark.slow
 def test_the_fuzzer_sees(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A reader that crashes, hangs, takes too much memory or raises something else is found."""
     package = tmp_path / "site" / "sitecustomize.py"

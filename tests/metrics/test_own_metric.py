@@ -56,6 +56,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     sys.modules.pop("mylab", None)
 
 
+@pytest.mark.slow
 def test_training_tensorboard_and_report_show_it(patch_file: Path, place: Path) -> None:  # noqa: F811
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 

@@ -241,6 +241,7 @@ def test_different_objects_are_each_seen_whole(tmp_path: Path, capsys: pytest.Ca
     assert not in_one_place(small, small + 3)
 
 
+@pytest.mark.slow
 def test_columns_of_text_and_panels_in_a_row(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cloud = sphere(300)
     np.savetxt(tmp_path / "c.txt", np.hstack([cloud[:, 3:], cloud[:, :3]]))

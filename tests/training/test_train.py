@@ -89,6 +89,7 @@ def scalars(run: Path, name: str) -> list[tuple[int, float]]:
 # --- the run folder ---
 
 
+@pytest.mark.slow
 def test_hydras_folder_is_the_run_folder(train: Train, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small = yaml.safe_load((train("trainer.max_steps=1") / "config.yaml").read_text())["data"]
     line = ["data=patches", *(f"data.{key}={small[key]}" for key in ("path", "input_points", "target_points"))]
@@ -393,6 +394,7 @@ def test_a_finished_run_without_its_last_checkpoint_is_kept(train: Train, capsys
     assert record(run)["status"] == "finished"
 
 
+@pytest.mark.slow
 def test_a_run_of_an_older_version_goes_on(train: Train) -> None:
     run = train("trainer.max_epochs=1")
     config = yaml.safe_load((run / "config.yaml").read_text())
@@ -479,6 +481,7 @@ def test_a_training_that_breaks_says_so(train: Train, tmp_path: Path, capsys: py
     assert len(list((tmp_path / "run").glob("nonfinite*.pt"))) == 1
 
 
+@pytest.mark.slow
 def test_a_checkpoint_that_cannot_be_written_is_no_success(
     train: Train, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -551,6 +554,7 @@ def test_onecycle_without_warm_up(train: Train) -> None:
     assert 1e-3 > first > last
 
 
+@pytest.mark.slow
 def test_early_stopping_stops(train: Train) -> None:
     stopping = "callbacks.early_stopping"
     options = ["callbacks=[default,early_stopping]", f"{stopping}.patience=1", f"{stopping}.min_delta=9"]
@@ -574,6 +578,7 @@ def test_without_validation_and_test(train: Train) -> None:
     assert not (run / "checkpoints/best.ckpt").exists()
 
 
+@pytest.mark.slow
 def test_training_goes_on_from_given_weights(train: Train, finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Started from a run's weights, the network before its first step is that run's."""
     first = train("trainer.max_steps=1", "trainer.val_check_interval=1", f"weights={finished}", "seed=9", "quiet=false")
