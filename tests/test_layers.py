@@ -264,6 +264,7 @@ def test_heavy_packages_stay_in_their_rooms(package: str) -> None:
     lightning = {
         "pnu.data.patch_module",
         "pnu.data.crop_module",
+        "pnu.training.adversarial_module",
         "pnu.training.lightning_module",
         "pnu.training.callbacks",
     }

@@ -71,7 +71,7 @@ def train(cfg: Any) -> list[float] | None:
         find = functools.partial(find_metric, allow=allow)
         chosen = metrics.with_own(config.get("metrics") or (), find)
         record["metrics"] = {m.shown.name: m.shown._asdict() for m in chosen if m not in metrics.METRICS}
-        module = lightning_module.UpsamplingModule(model, **parts, metrics=chosen)
+        module = module_of(parts["loss"], config["trainer"])(model, **parts, metrics=chosen)
         options: Any = {
             name: value for name, value in lightning_module.TRAINER_OPTIONS.items() if name not in config["trainer"]
         }
@@ -97,6 +97,17 @@ def train(cfg: Any) -> list[float] | None:
     if is_main_process():
         print(run if config["quiet"] else job_line(run) if "job" in run.facts else closing_lines(run))
     return result
+
+
+def module_of(loss: Any, trainer: Any) -> Any:
+    """The Lightning module that trains with a loss; ValueError where the trainer's options do not go with it."""
+    from pnu.losses import AdversarialLoss
+    from pnu.training import adversarial_module, lightning_module
+
+    if not isinstance(loss, AdversarialLoss):
+        return lightning_module.UpsamplingModule
+    adversarial_module.check_manual(trainer)
+    return adversarial_module.AdversarialModule
 
 
 main = command(train, Train)

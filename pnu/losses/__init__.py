@@ -1,7 +1,8 @@
 """Losses: `loss(prediction, target, extra)` gives every term by name and their weighted sum as "loss"."""
 
+from pnu.losses.adversarial import AdversarialLoss
 from pnu.losses.compound import CompoundLoss
 from pnu.losses.projection import SurfaceLoss
 from pnu.losses.rivals import EdgeAwareLoss, ParameterizationLoss, RepulsionLoss
 
-__all__ = ["CompoundLoss", "EdgeAwareLoss", "ParameterizationLoss", "RepulsionLoss", "SurfaceLoss"]
+__all__ = ["AdversarialLoss", "CompoundLoss", "EdgeAwareLoss", "ParameterizationLoss", "RepulsionLoss", "SurfaceLoss"]

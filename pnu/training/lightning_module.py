@@ -236,7 +236,10 @@ class UpsamplingModule(pl.LightningModule):
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         assert self.optimizer is not None
-        optimizer = self.optimizer(self.parameters())
+        return self.scheduled(self.optimizer(self.parameters()))
+
+    def scheduled(self, optimizer: torch.optim.Optimizer) -> OptimizerLRScheduler:
+        """An optimizer, with its schedule where there is one."""
         if self.scheduler is None:
             return optimizer
         cls = getattr(self.scheduler, "func", self.scheduler)
