@@ -3,6 +3,14 @@
 from pnu.losses.adversarial import AdversarialLoss
 from pnu.losses.compound import CompoundLoss
 from pnu.losses.projection import SurfaceLoss
-from pnu.losses.rivals import EdgeAwareLoss, ParameterizationLoss, RepulsionLoss
+from pnu.losses.rivals import EdgeAwareLoss, ParameterizationLoss, PyramidLoss, RepulsionLoss
 
-__all__ = ["AdversarialLoss", "CompoundLoss", "EdgeAwareLoss", "ParameterizationLoss", "RepulsionLoss", "SurfaceLoss"]
+__all__ = [
+    "AdversarialLoss",
+    "CompoundLoss",
+    "EdgeAwareLoss",
+    "ParameterizationLoss",
+    "PyramidLoss",
+    "RepulsionLoss",
+    "SurfaceLoss",
+]

@@ -178,3 +178,26 @@ class ParameterizationLoss(nn.Module):
 def unsigned_sq(a: Tensor, b: Tensor) -> Tensor:
     """Squared difference of vectors (..., 3) up to the sign of one of them."""
     return torch.minimum((a - b).square().sum(-1), (a + b).square().sum(-1))
+
+
+class PyramidLoss(nn.Module):
+    """DensePCR: the Chamfer distance of every stage's points, 1 for the last and w_coarse for the one before.
+
+    Reads "coarse" (B, m / 4, 3) from `extra`, if the network has two stages; the paper trains its stages one after
+    the other and then together, here they are trained together from the start.
+
+    Args:
+        w_coarse: weight of the first stage's Chamfer distance, where there are two
+    """
+
+    def __init__(self, w_coarse: float = 1.0) -> None:
+        super().__init__()
+        self.weights = {"cd": 1.0, "cd_coarse": w_coarse}
+
+    def forward(
+        self, prediction: Tensor, target: Tensor, extra: Mapping[str, Tensor] | None = None
+    ) -> dict[str, Tensor]:
+        terms = {"cd": chamfer(prediction, target, search(prediction, target, 1))}
+        if extra and "coarse" in extra:
+            terms["cd_coarse"] = chamfer(extra["coarse"], target, search(extra["coarse"], target, 1))
+        return total(terms, self.weights)

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor, nn
 
 from pnu import networks
-from pnu.losses import EdgeAwareLoss, ParameterizationLoss, RepulsionLoss
+from pnu.losses import EdgeAwareLoss, ParameterizationLoss, PyramidLoss, RepulsionLoss
 from pnu.losses.rivals import surface_distance_sq, unsigned_sq
+from pnu.networks.densepcr import DensePCR
 
 NETWORKS = {"punet.PUNet": 3, "ecnet.ECNet": 3, "pugeo.PUGeo": 6}
 
@@ -186,3 +187,49 @@ def test_training_steps_lower_the_loss(name: str, loss: nn.Module) -> None:
         values.append(float(value.detach()))
     assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in model.parameters())
     assert values[-1] < 0.9 * values[0]
+
+
+def stages() -> DensePCR:
+    torch.manual_seed(0)
+    return DensePCR()
+
+
+def test_densepcr_against_its_layer_table() -> None:
+    model = stages()
+    widths = [[m for m in stage.modules() if isinstance(m, nn.Linear)] for stage in model.stages]
+    found = [[(layer.in_features, layer.out_features) for layer in layers] for layers in widths]
+    assert (
+        found
+        == [[(3, 32), (32, 64), (64, 64), (3, 32), (32, 32), (32, 64), (133, 64), (64, 128), (128, 128), (128, 3)]] * 2
+    )
+    outputs = model.outputs(patch(n=64))
+    assert (outputs["coarse"].shape, outputs["prediction"].shape) == ((2, 256, 3), (2, 1024, 3))
+    assert "coarse" not in DensePCR(4).outputs(patch(n=64))
+    with pytest.raises(ValueError, match="model.ratio: expected 4 or 16, one or two stages, got 8"):
+        DensePCR(8)
+    with pytest.raises(ValueError, match="patch: expected"):
+        model(patch(n=30))
+
+
+def test_densepcr_sees_point_cloud_neighborhood_and_grid() -> None:
+    stage, seen = stages().stages[0], []
+    stage.dense.register_forward_pre_hook(lambda module, args: seen.append(args[0]))
+    points = patch(1, 64)[..., :3]
+    stage(points)
+    (rows,) = seen
+    assert torch.equal(rows[0, 4 * 7 + 2, :3], points[0, 7])
+    assert torch.equal(rows[0, 0, 3:67], rows[0, -1, 3:67])  # the cloud's feature is that of all
+    grid = torch.tensor([[-0.1, -0.1], [-0.1, 0.1], [0.1, -0.1], [0.1, 0.1]])
+    torch.testing.assert_close(rows[0, 28:32, -2:], grid)
+
+
+def test_pyramid_loss_by_hand() -> None:
+    target = torch.zeros(1, 2, 3, dtype=torch.float64)
+    moved = target + torch.tensor([0.0, 0, 1])
+    terms = PyramidLoss(w_coarse=0.5)(moved, target, {"coarse": target + torch.tensor([0.0, 0, 2])})
+    assert {name: float(value) for name, value in terms.items()} == {"cd": 2, "cd_coarse": 8, "loss": 6}
+    assert float(PyramidLoss()(moved, target)["loss"]) == 2
+    dense = patch(1, 32)[..., :3].double().requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda p: PyramidLoss()(p, patch(1, 16).double(), {"coarse": p[:, :8]})["loss"], dense, fast_mode=True
+    )
