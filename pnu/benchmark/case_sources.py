@@ -71,6 +71,20 @@ def case_source(
         return CaseSource(root.resolve().name, names, ["given"], pair_cases(root, names, columns=columns, **options))
     if columns is not None:
         raise ValueError(f"columns={columns}: is for prepared pairs, data=meshes data.root=FOLDER with clouds/, truth/")
+    name, makers = shape_makers(data, part, only)
+    names = list(makers)
+    return CaseSource(
+        name,
+        names,
+        list(kinds),
+        mesh_cases(makers, kinds, points=points, inputs=inputs, noise_limit=noise_limit, **options),
+    )
+
+
+def shape_makers(
+    data: Mapping[str, Any], part: str | None = None, only: Sequence[str] | None = None
+) -> tuple[str, dict[str, Callable[[], Mesh]]]:
+    """The name of `data`, and what makes the meshes of its shapes: of a folder, or procedural."""
     makers: dict[str, Callable[[], Mesh]]
     if data.get("root"):
         name, part = Path(data["root"]).resolve().name, part or "all"
@@ -83,14 +97,7 @@ def case_source(
             "data: evaluation takes whole shapes: data=synthetic, or data=meshes data.root=FOLDER, a folder of meshes "
             "or one with clouds/ and truth/"
         )
-    names = chosen_names(list(makers), data, part, only)
-    makers = {shape: makers[shape] for shape in names}
-    return CaseSource(
-        name,
-        names,
-        list(kinds),
-        mesh_cases(makers, kinds, points=points, inputs=inputs, noise_limit=noise_limit, **options),
-    )
+    return name, {shape: makers[shape] for shape in chosen_names(list(makers), data, part, only)}
 
 
 def chosen_names(names: list[str], data: Mapping[str, Any], part: str, only: Sequence[str] | None) -> list[str]:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from pnu.commands._entry import command
+from pnu.commands._normal_task import evaluate_task
 from pnu.commands._protocol import protocol_source
 from pnu.config.instantiate import find_metric
 from pnu.config.quoting import shell_line
@@ -24,6 +25,7 @@ class Evaluate:
 
     also: ClassVar = {"model": "run"}
     commas: ClassVar = ("columns",)
+    task: str = doc("upsampling; or normals: PCA, jets and pnu's estimate on clouds of PCPNet's kinds")
     run: str | None = doc(
         "run folder, or name or file of weights; newest: the run that finished last; null: `method`, or surface"
     )
@@ -63,6 +65,9 @@ class Evaluate:
 def evaluate(cfg: Any) -> None:
     """Measure one method on the shapes; tables, and files in the run folder."""
     _check_options(cfg)
+    if cfg.task == "normals":
+        evaluate_task(cfg)
+        return
     from pnu import benchmark, io, metrics
     from pnu.geometry.mesh_sampling import closest_points
     from pnu.metrics import ray_casting
@@ -127,7 +132,11 @@ def evaluate(cfg: Any) -> None:
 
 def _check_options(cfg: Any) -> None:
     """Refuse what can be refused before anything is loaded."""
-    for key, known in (("normals", tuple(NORMALS)), ("search", ("exact", "open3d"))):
+    for key, known in (
+        ("task", ("upsampling", "normals")),
+        ("normals", tuple(NORMALS)),
+        ("search", ("exact", "open3d")),
+    ):
         if cfg[key] not in known:
             raise ValueError(f"{key}={cfg[key]}: expected {' or '.join(known)}")
     if cfg.run and cfg.method:

@@ -1,0 +1,161 @@
+"""Normals as a task of its own: clouds of PCPNet's kinds, methods that give normals, their errors and time."""
+
+import csv
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from pnu.benchmark.cases import generator
+from pnu.benchmark.measuring import Row
+from pnu.geometry.jet_normals import jet_normals
+from pnu.geometry.mesh_sampling import sample_area
+from pnu.geometry.normal_estimation import estimate_normals, orient_normals
+from pnu.io import Mesh
+from pnu.metrics.normal_scores import normal_scores
+
+PUBLISHED_NORMALS = Path(__file__).with_name("published_normals.csv")
+NORMAL_KINDS = ("clean", "noise_0.12", "noise_0.6", "noise_1.2", "striped", "gradient")
+"""Of PCPNet: random by area; with Gaussian noise of so many percent of the box's diagonal in each coordinate, normals
+those of the clean places; in stripes of which every other one is nearly empty; thinner and thinner along an axis."""
+
+CANDIDATES, THIN, STRIPES = 6, 0.05, 12  # points drawn for each one kept; density of the thinnest; stripes in all
+Estimator = Callable[[np.ndarray], np.ndarray]
+"""points (n, 3) -> normals (n, 3), oriented as far as it can."""
+
+COLUMNS = {
+    "unoriented_rms_deg": ("RMS", 1.0, ".2f"), "unoriented_pgp5": ("PGP5", 100.0, ".1f"),
+    "unoriented_pgp10": ("PGP10", 100.0, ".1f"), "oriented_rms_deg": ("RMS oriented", 1.0, ".2f"),
+    "oriented_pgp5": ("PGP5 or.", 100.0, ".1f"), "oriented_pgp10": ("PGP10 or.", 100.0, ".1f"),
+    "flipped": ("flipped %", 100.0, ".2f"), "seconds": ("s", 1.0, ".2f"),
+}  # fmt: skip
+
+
+def estimators(neighbors: int = 24) -> dict[str, Estimator]:
+    """PCA and jets, both oriented as pnu orients, and pnu's own estimate."""
+
+    def oriented(lines: Callable[[torch.Tensor], torch.Tensor]) -> Estimator:
+        def estimate(points: np.ndarray) -> np.ndarray:
+            cloud = torch.from_numpy(points)
+            return orient_normals(cloud, lines(cloud[None])[0]).numpy()
+
+        return estimate
+
+    return {
+        "pca": oriented(lambda cloud: estimate_normals(cloud, neighbors, orient=False)),
+        "jets": oriented(lambda cloud: jet_normals(cloud, neighbors)),
+        "pnu": lambda points: estimate_normals(torch.from_numpy(points)[None])[0].numpy(),
+    }
+
+
+class NormalCase(NamedTuple):
+    """A cloud, and the true normals of its points."""
+
+    shape: str
+    kind: str
+    points: np.ndarray  # (n, 3)
+    normals: np.ndarray  # (n, 3)
+
+
+def normal_cases(
+    meshes: Mapping[str, Callable[[], Mesh]], kinds: Sequence[str], *, points: int, seed: int = 0
+) -> Iterator[NormalCase]:
+    """Clouds of all kinds from each mesh, drawn by (seed, shape, kind) alone. ValueError for a kind that is none."""
+    if unknown := [kind for kind in kinds if kind not in NORMAL_KINDS]:
+        raise ValueError(f"kinds={unknown[0]}: expected some of {', '.join(NORMAL_KINDS)}")
+    for shape, make in meshes.items():
+        mesh = make()
+        for kind in kinds:
+            cloud = draw_cloud(mesh, kind, points, generator(seed, shape, f"normals {kind}"))
+            yield NormalCase(shape, kind, cloud[:, :3], cloud[:, 3:])
+
+
+def draw_cloud(mesh: Mesh, kind: str, n: int, rng: np.random.Generator) -> np.ndarray:
+    """n points of a surface with its normals, (n, 6), of one of `NORMAL_KINDS`."""
+    if kind in ("striped", "gradient"):
+        cloud = sample_area(mesh, CANDIDATES * n, rng)
+        along = cloud[:, np.ptp(cloud[:, :3], axis=0).argmax()]
+        place = (along - along.min()) / max(np.ptp(along), 1e-300)
+        share = np.where(np.floor(STRIPES * place) % 2 == 0, 1.0, THIN) if kind == "striped" else THIN ** (place)
+        drawn: np.ndarray = cloud[rng.choice(len(cloud), n, replace=False, p=share / share.sum())]
+        return drawn
+    cloud = sample_area(mesh, n, rng)
+    if kind.startswith("noise_"):
+        diagonal = np.linalg.norm(np.ptp(cloud[:, :3], axis=0))
+        cloud[:, :3] += rng.normal(scale=float(kind.removeprefix("noise_")) / 100 * diagonal, size=(n, 3))
+    return cloud
+
+
+def evaluate_normals(
+    methods: Mapping[str, Estimator], cases: Iterable[NormalCase], step: Callable[[str], None] = lambda text: None
+) -> Iterator[Row]:
+    """A row of errors and seconds for each case and method."""
+    for case in cases:
+        for name, estimate in methods.items():
+            step(f"{case.shape}, {case.kind}: {name}")
+            started = time.perf_counter()
+            found = estimate(case.points)
+            seconds = time.perf_counter() - started
+            head = {"shape": case.shape, "kind": case.kind, "method": name, "points": len(case.points)}
+            yield head | normal_scores(found, case.normals) | {"seconds": seconds}
+
+
+def mean_rows(rows: Sequence[Row]) -> list[Row]:
+    """Means over shapes for each kind and method, and for each method over the kinds' means ("all")."""
+    kinds, methods = (list(dict.fromkeys(row[name] for row in rows)) for name in ("kind", "method"))
+    found = [
+        {"kind": kind, "method": method}
+        | {
+            name: float(np.mean([r[name] for r in rows if (r["kind"], r["method"]) == (kind, method)]))
+            for name in COLUMNS
+        }
+        for kind in kinds
+        for method in methods
+    ]
+    for method in methods if len(kinds) > 1 else ():
+        own = [row for row in found if row["method"] == method]
+        found.append(
+            {"kind": "all", "method": method} | {name: float(np.mean([row[name] for row in own])) for name in COLUMNS}
+        )
+    return found
+
+
+def print_normal_tables(rows: Sequence[Row]) -> None:
+    """Means over shapes for each kind, then the published rows in a table of their own."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(width=max(Console().width, 118), highlight=False)
+    shapes = len({row["shape"] for row in rows})
+    table = Table(title=f"Normals, means of {shapes} shapes", title_justify="left", title_style="bold")
+    for head in ("kind", "method"):
+        table.add_column(head)
+    for head, _, _ in COLUMNS.values():
+        table.add_column(head, justify="right")
+    last = ""
+    for row in mean_rows(rows):
+        cells = [format(factor * row[name], form) for name, (_, factor, form) in COLUMNS.items()]
+        if last not in ("", row["kind"]):
+            table.add_section()
+        last = row["kind"]
+        table.add_row(row["kind"], row["method"], *cells)
+    console.print(table)
+    console.print("RMS: root mean square of the angles in degrees. PGP5, PGP10: % of points below 5 and 10 degrees.")
+    published = Table(title="Published on PCPNet's shapes, not measured here", title_justify="left")
+    for head in ("method", "signs", "RMS", "source"):
+        published.add_column(head)
+    for found in published_normals():
+        published.add_row(found["method"], found["signs"], found["rms_deg"], found["source"])
+    console.print(published)
+
+
+def published_normals() -> list[dict[str, str]]:
+    """The rows of published_normals.csv."""
+    with PUBLISHED_NORMALS.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert all(math.isfinite(float(row["rms_deg"])) for row in rows)
+    return rows
