@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnu import reconstruction, rendering
-from pnu.benchmark import Case, Row
+from pnu.benchmark import SCANS, Case, Row
 from pnu.benchmark.measuring import normals_of
 from pnu.geometry.mesh_sampling import closest_points
 from pnu.io import Mesh
@@ -20,6 +20,7 @@ Picture = NDArray[np.uint8]
 
 BYTES_POINT, BYTES_VERTEX = 12.0, 21.0  # in a page, packed
 FEWEST = 1000  # points of a cloud that still show a shape
+REACH = 4.0  # spacings from all points beyond which the surface of a scan is cut off
 
 
 class ShownCase(NamedTuple):
@@ -52,7 +53,10 @@ class Rebuilt(NamedTuple):
 
 
 def rebuild(shown: ShownCase, seed: int = 0) -> tuple[dict[str, Rebuilt], list[str]]:
-    """The surface of each cloud with normals, measured against the truth; and what went wrong, a line each."""
+    """The surface of each cloud with normals, measured against the truth; and what went wrong, a line each.
+
+    Those of scans end where the points end, as `pnu reconstruct` makes them.
+    """
     made, notes = {}, []
     truth = shown.case.truth
     if truth.mesh is None:
@@ -60,7 +64,8 @@ def rebuild(shown: ShownCase, seed: int = 0) -> tuple[dict[str, Rebuilt], list[s
 
     def surface_of(cloud: np.ndarray) -> reconstruction.ReconstructedSurface | str:
         try:
-            return reconstruction.reconstruct(cloud[:, :3], cloud[:, 3:])
+            surface = reconstruction.reconstruct(cloud[:, :3], cloud[:, 3:])
+            return reconstruction.cut_off(surface, cloud, REACH) if shown.case.kind in SCANS else surface
         except ValueError as error:
             return str(error)
 
