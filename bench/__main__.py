@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 
-from bench import inference, ops, scale, step
+from bench import compiled, inference, ops, scale, step
 from bench.timing import Row
 from pnu.io import atomic_path, write_json
 from pnu.runtime.provenance import provenance
@@ -23,6 +23,7 @@ PARTS: dict[str, Callable[[], Iterable[Row]]] = {
     "ops": ops.rows,
     "loss": step.loss_rows,
     "step": step.step_rows,
+    "compiled": compiled.rows,
     "inference": inference.rows,
 }
 PACKAGES = ("torch", "numpy", "scipy", "numba", "open3d")

@@ -13,7 +13,7 @@ from pnu.kernels.compilation import kernel
 LEAF = 16  # points
 CHILDREN = 8
 NOWHERE = 1e150  # places of points and boxes that are not there; its square is finite
-MORE = 1.6  # times the squared radius in which the query before found its neighbors
+MORE = 3.0  # / sqrt(k): by that share more than the squared radius in which the query before found its neighbors
 ROOM = 8  # times k, at most, are collected before those too far are dropped
 
 
@@ -197,12 +197,12 @@ def _search(
     dist, found, sorted_ = np.empty(room), np.empty(room, np.int64), np.empty(room, np.int64)
     nearby = np.empty(max(room, CHILDREN * k + LEAF * CHILDREN))
     far, stack = np.empty(CHILDREN), np.empty((24 * CHILDREN, 2), np.int64)
-    limit = -1.0
+    limit, grow = -1.0, 1 + MORE / np.sqrt(k)
     for q in range(len(queries)):
         x, y, z = queries[q]
         count = 0
         if limit >= 0:
-            count = _within(x, y, z, limit * MORE, k, axes, ids, boxes, levels, far, stack, dist, found)
+            count = _within(x, y, z, limit * grow, k, axes, ids, boxes, levels, far, stack, dist, found)
         if 0 <= count < k:
             limit = _enough(x, y, z, k, n, axes, boxes, levels, far, nearby)
             count = _within(x, y, z, limit, k, axes, ids, boxes, levels, far, stack, dist, found)
