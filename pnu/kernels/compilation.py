@@ -14,6 +14,7 @@ import platform
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -23,6 +24,7 @@ from typing import Any
 HERE = Path(__file__).parent
 KERNELS = ("boxes", "neighbors", "greedy_sampling", "frames", "projector", "dipoles", "planes")
 COMPLETE, LOCK, FAILED = "complete", "lock", "failed"
+OLD = 30 * 86400  # seconds
 EXACT = {"nnan", "ninf", "nsz"}  # results have the bits of NumPy's operations in the order written
 LOOSE = {"nnan", "ninf", "nsz", "arcp", "contract", "reassoc"}  # to rounding
 
@@ -88,7 +90,7 @@ def compile_all(*, wait: bool = True) -> bool:
                 for name in KERNELS:
                     importlib.import_module(f"pnu.kernels.{name}")
                 (place / COMPLETE).touch()
-                _forget_others(place)
+                _forget_old(place)
     except Exception as error:  # a compiler can fail in many ways, and nobody needs it
         _note(place, error)
         return False
@@ -122,12 +124,11 @@ def _start() -> None:
     subprocess.Popen([sys.executable, "-m", __name__], start_new_session=True, **quiet)
 
 
-def _forget_others(place: Path) -> None:
-    """Remove what was compiled of other states of these very files."""
-    if place.parent == HERE / "__pycache__":
-        for other in place.parent.glob("kernels-*"):
-            if other != place:
-                shutil.rmtree(other, ignore_errors=True)
+def _forget_old(place: Path) -> None:
+    """Remove what was compiled long ago of other states of these files; what is newer may be in use."""
+    for other in place.parent.glob("kernels-*"):
+        if other != place and time.time() - other.stat().st_mtime > OLD:
+            shutil.rmtree(other, ignore_errors=True)
 
 
 def _complete(place: Path | None) -> bool:

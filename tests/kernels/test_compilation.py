@@ -2,8 +2,10 @@
 
 import importlib.util
 import os
+import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -111,3 +113,61 @@ def test_another_source_has_another_folder(tmp_path: Path, monkeypatch: pytest.M
     assert compilation._key() == before
     (tmp_path / "boxes.py").write_text("a = 2")
     assert compilation._key() != before
+
+
+def test_old_states_are_forgotten_newer_ones_are_not(empty: Path) -> None:
+    for name, age in (("old", 40), ("newer", 2)):
+        other = empty.with_name(f"kernels-{name}")
+        other.mkdir()
+        past = time.time() - age * 86400
+        os.utime(other, (past, past))
+    assert compilation.compile_all()
+    assert {path.name for path in empty.parent.iterdir()} == {"kernels-new", "kernels-newer"}
+
+
+@pytest.mark.slow
+def test_the_background_compiles_while_torch_answers(tmp_path: Path) -> None:
+    """A copy of the package on which nothing is compiled; then the same call is answered by kernels."""
+    package = Path(compilation.__file__).parents[1]
+    shutil.copytree(package, tmp_path / "pnu", ignore=shutil.ignore_patterns("__pycache__"))
+    code = """
+import time, numpy as np, pnu
+from pnu import kernels
+points = np.random.default_rng(0).normal(size=(2600, 3))
+points /= np.linalg.norm(points, axis=1, keepdims=True)
+def make():
+    return pnu.upsample(points, points, ratio=4, outliers="keep")
+assert not kernels.ready()
+plain = make()
+ends = time.time() + 900
+while not kernels.ready():
+    assert time.time() < ends
+    time.sleep(1)
+found = make()
+print((abs(found - plain).max(1) < 1e-5).mean())
+"""
+    environment = {key: value for key, value in os.environ.items() if key not in ("PYTEST_VERSION", "CI", "PNU_FAST")}
+    environment |= {"PYTHONPATH": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) > 0.98
+
+
+@pytest.mark.slow
+def test_sixteen_lanes_compute_the_same(untraced: None) -> None:
+    """What a processor with AVX-512 takes, in halves here."""
+    root = Path(__file__).resolve().parents[2]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "tests/fast/test_compiled_projector.py",
+        "-k",
+        "projection or feet",
+    ]
+    environment = os.environ | {"PNU_LANES": "16"}
+    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
