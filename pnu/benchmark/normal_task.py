@@ -5,25 +5,22 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
+from torch import nn
 
 from pnu.benchmark.cases import generator
 from pnu.benchmark.measuring import Row
+from pnu.data.normal_patches import NORMAL_KINDS, draw_cloud
 from pnu.geometry.jet_normals import jet_normals
-from pnu.geometry.mesh_sampling import sample_area
 from pnu.geometry.normal_estimation import estimate_normals, orient_normals
 from pnu.io import Mesh
 from pnu.metrics.normal_scores import normal_scores
 
 PUBLISHED_NORMALS = Path(__file__).with_name("published_normals.csv")
-NORMAL_KINDS = ("clean", "noise_0.12", "noise_0.6", "noise_1.2", "striped", "gradient")
-"""Of PCPNet: random by area; with Gaussian noise of so many percent of the box's diagonal in each coordinate, normals
-those of the clean places; in stripes of which every other one is nearly empty; thinner and thinner along an axis."""
-
-CANDIDATES, THIN, STRIPES = 6, 0.05, 12  # points drawn for each one kept; density of the thinnest; stripes in all
 Estimator = Callable[[np.ndarray], np.ndarray]
 """points (n, 3) -> normals (n, 3), oriented as far as it can."""
 
@@ -52,6 +49,31 @@ def estimators(neighbors: int = 24) -> dict[str, Estimator]:
     }
 
 
+def network_estimator(network: nn.Module, name: str, at_once: int = 512) -> Estimator:
+    """A network of neighborhoods, such as PCPNet; what it gives without signs is oriented as pnu orients.
+
+    ValueError for a network of another task.
+    """
+    if getattr(network, "task", "upsampling") != "normals":
+        raise ValueError(f"run={name}: is no network of normals, which task=normals trains")
+    found: Any = network
+    k = found.neighbors[-1]
+
+    def estimate(points: np.ndarray) -> np.ndarray:
+        if len(points) < k:
+            raise ValueError(f"points={len(points)}: {name} sees {k} neighbors, give as many points")
+        near = cKDTree(points).query(points, k=k)[1]
+        with torch.no_grad():
+            rows = [
+                found(torch.from_numpy(points[idx] - points[idx[:, :1]]).float()[None])[0, :, 3:].double()
+                for idx in np.array_split(near, -(-len(near) // at_once))
+            ]
+        lines = torch.nn.functional.normalize(torch.cat(rows), dim=1)
+        return (lines if found.oriented else orient_normals(torch.from_numpy(points), lines)).numpy()
+
+    return estimate
+
+
 class NormalCase(NamedTuple):
     """A cloud, and the true normals of its points."""
 
@@ -72,22 +94,6 @@ def normal_cases(
         for kind in kinds:
             cloud = draw_cloud(mesh, kind, points, generator(seed, shape, f"normals {kind}"))
             yield NormalCase(shape, kind, cloud[:, :3], cloud[:, 3:])
-
-
-def draw_cloud(mesh: Mesh, kind: str, n: int, rng: np.random.Generator) -> np.ndarray:
-    """n points of a surface with its normals, (n, 6), of one of `NORMAL_KINDS`."""
-    if kind in ("striped", "gradient"):
-        cloud = sample_area(mesh, CANDIDATES * n, rng)
-        along = cloud[:, np.ptp(cloud[:, :3], axis=0).argmax()]
-        place = (along - along.min()) / max(np.ptp(along), 1e-300)
-        share = np.where(np.floor(STRIPES * place) % 2 == 0, 1.0, THIN) if kind == "striped" else THIN ** (place)
-        drawn: np.ndarray = cloud[rng.choice(len(cloud), n, replace=False, p=share / share.sum())]
-        return drawn
-    cloud = sample_area(mesh, n, rng)
-    if kind.startswith("noise_"):
-        diagonal = np.linalg.norm(np.ptp(cloud[:, :3], axis=0))
-        cloud[:, :3] += rng.normal(scale=float(kind.removeprefix("noise_")) / 100 * diagonal, size=(n, 3))
-    return cloud
 
 
 def evaluate_normals(

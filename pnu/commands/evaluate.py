@@ -25,7 +25,7 @@ class Evaluate:
 
     also: ClassVar = {"model": "run"}
     commas: ClassVar = ("columns",)
-    task: str = doc("upsampling; or normals: PCA, jets and pnu's estimate on clouds of PCPNet's kinds")
+    task: str = doc("upsampling; or normals: PCA, jets, pnu's estimate and a run of task=normals, on PCPNet's kinds")
     run: str | None = doc(
         "run folder, or name or file of weights; newest: the run that finished last; null: `method`, or surface"
     )

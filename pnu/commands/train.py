@@ -2,7 +2,7 @@
 
 import functools
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from pnu.commands._entry import command
 from pnu.config.instantiate import PACKAGES, find_metric, instantiate
@@ -12,8 +12,10 @@ from pnu.runtime.provenance import machine
 
 @dataclass
 class Train:
-    """Train an upsampling network. Ends with its test metrics and a run folder for `pnu upsample`."""
+    """Train an upsampling network; `task=normals`, which is `experiment=normals`, one of normals. Ends with its test
+    metrics and a run folder for `pnu upsample`."""
 
+    also: ClassVar = {"task": "experiment"}
     seed: int = doc("of the weights, the order of the data and their augmentation")
     name: str = doc("last part of the run folder's name")
     run: str | None = doc("run folder; null: outputs/<date>/<time>_<name>")
@@ -85,7 +87,11 @@ def train(cfg: Any) -> list[float] | None:
                 default_root_dir=run.path,
                 **options,
             )
-        record |= {"device": str(trainer.strategy.root_device), "machine": machine()}
+        record |= {
+            "task": getattr(model, "task", "upsampling"),
+            "device": str(trainer.strategy.root_device),
+            "machine": machine(),
+        }
         start = run.last if run.last.exists() else None
         if start is None:
             run.add_metrics("start" if source else "untrained", trainer.validate(module, data, verbose=False))

@@ -2,6 +2,7 @@
 
 from pnu.losses.adversarial import AdversarialLoss
 from pnu.losses.compound import CompoundLoss
+from pnu.losses.normals import NormalLoss
 from pnu.losses.projection import SurfaceLoss
 from pnu.losses.rivals import EdgeAwareLoss, ParameterizationLoss, PyramidLoss, RepulsionLoss
 
@@ -9,6 +10,7 @@ __all__ = [
     "AdversarialLoss",
     "CompoundLoss",
     "EdgeAwareLoss",
+    "NormalLoss",
     "ParameterizationLoss",
     "PyramidLoss",
     "RepulsionLoss",

@@ -74,4 +74,6 @@ def closing_lines(run: RunFolder) -> str:
         kept = "no checkpoint was kept: trainer.fast_dev_run, or no callbacks.checkpoints"
         return "\n".join(["", *lines, "", f"run folder: {run}", kept])
     upsample = run.line("upsample", input="cloud.ply", output="dense.ply")
+    if run.read_record().get("task") == "normals":
+        upsample = run.line("evaluate", task="normals")
     return "\n".join(["", *lines, "", f"run folder: {run}", f"next: {upsample}"])

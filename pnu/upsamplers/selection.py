@@ -41,6 +41,10 @@ def upsampler_of(model: Any, patch_size: int | None = None) -> Upsampler:
     One that has `upsample_cloud` is an upsampler itself. A network says by its attribute `procedure` which one is made
     for it: "surface" for networks that project points; without it "patches", of `patch_size` points if not None.
     """
+    if getattr(model, "task", "upsampling") != "upsampling":
+        raise ValueError(
+            f"model: {type(model).__name__} estimates normals and makes no points; take one that upsamples"
+        )
     if hasattr(model, "upsample_cloud"):
         itself: Upsampler = model
         return itself

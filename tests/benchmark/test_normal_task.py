@@ -8,11 +8,14 @@ import torch
 
 from pnu.benchmark import normal_task
 from pnu.commands.evaluate import main
+from pnu.data.normal_patches import NORMAL_KINDS
 from pnu.geometry.jet_normals import jet_normals
 from pnu.geometry.mesh_sampling import closest_points
 from pnu.geometry.normal_estimation import estimate_normals
 from pnu.io import read_json, write_mesh
 from pnu.metrics.normal_scores import angles_deg, normal_scores
+from pnu.networks.pcpnet import PCPNet
+from pnu.upsamplers import upsampler_of
 from tests.reconstruction.test_surfaces import icosphere
 
 
@@ -54,7 +57,7 @@ def test_jets_are_exact_on_their_own_surfaces() -> None:
         jet_normals(points, 5)
 
 
-@pytest.mark.parametrize("kind", normal_task.NORMAL_KINDS)
+@pytest.mark.parametrize("kind", NORMAL_KINDS)
 def test_clouds_of_each_kind(kind: str) -> None:
     ball = icosphere(3)
     ball = ball._replace(vertices=ball.vertices * [2, 1, 1])
@@ -90,7 +93,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     for arguments, message in (
         (["method=apss"], "method=apss: expected pca, jets, pnu with task=normals"),
         (["kinds=[uniform]"], "kinds=uniform: expected some of clean, noise_0.12"),
-        (["run=surface"], "run=surface: task=normals measures what needs no run"),
+        (["run=pnu"], "run=pnu: is no network of normals, which task=normals trains"),
     ):
         with pytest.raises(SystemExit):
             main([*data, *arguments])
@@ -98,3 +101,16 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     with pytest.raises(SystemExit):
         main(["task=normal"])
     assert "task=normal: expected upsampling or normals" in capsys.readouterr().err
+
+
+def test_a_network_of_neighborhoods() -> None:
+    torch.manual_seed(0)
+    network = PCPNet((8, 16), 0.05).eval()
+    points = icosphere(3).vertices
+    found = normal_task.network_estimator(network, "tiny", at_once=100)(points)
+    assert found.shape == points.shape
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-6)
+    with pytest.raises(ValueError, match="points=10: tiny sees 16 neighbors"):
+        normal_task.network_estimator(network, "tiny")(points[:10])
+    with pytest.raises(ValueError, match="PCPNet estimates normals and makes no points"):
+        upsampler_of(network)

@@ -126,6 +126,7 @@ PLACES = {
     "commands/normals.py normals": "test_normals_then_a_denser_cloud",
     "commands/export.py export": "test_weights_kept_as_a_file",
     "commands/convert.py convert": "test_weights_of_the_released_code",
+    "commands/_normal_task.py evaluate_task": "test_normals_measured_then_made",
     "commands/evaluate.py evaluate": "test_an_evaluation_then_a_comparison",
     "commands/compare.py compare": "test_an_evaluation_then_a_comparison",
     "commands/compare.py upsamplers": "test_a_name_that_is_taken",
@@ -238,6 +239,15 @@ def test_normals_then_a_denser_cloud(say: Say) -> None:
     made = say(shell_line("normals", input="cloud.ply", output=in_nasty("normals.ply"), viewpoint="0,0,-3"))
     say(printed(made), "ratio=1")
     assert len(read_cloud("dense.ply").points) == len(read_cloud(in_nasty("normals.ply")).points)
+
+
+def test_normals_measured_then_made(say: Say) -> None:
+    Path(in_nasty("shapes")).mkdir()
+    write_mesh(in_nasty("shapes/mug.ply"), shapes.make("mug"))
+    data = {"task": "normals", "data": "meshes", "data.root": in_nasty("shapes")}
+    measured = say(shell_line("evaluate", **data), "method=pca", "kinds=[clean]", "points=100")
+    say(printed(measured))
+    assert read_cloud("with_normals.ply").normals is not None
 
 
 def test_weights_kept_as_a_file(say: Say, trained: str) -> None:
