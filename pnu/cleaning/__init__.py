@@ -3,16 +3,20 @@
 from typing import Literal, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from pnu.cleaning.outliers import stray_points
+from pnu.cleaning.outliers import MANY, stray_points
 from pnu.geometry.anisotropy import averaged, thinned_lines
 from pnu.geometry.cloud_normals import contradiction, settled_normals
+from pnu.geometry.noise_level import noise_level
+from pnu.geometry.spacing import spacing
 from pnu.io import Cloud
 from pnu.io.cloud import chosen
 
 Treatment = Literal["auto", "keep"]
 TREATMENTS = ("auto", "keep")
+NOISY = 0.45  # spacings of noise that hides what a scan is
 
 __all__ = ["TREATMENTS", "Cleaned", "Treatment", "clean_cloud", "stray_points"]
 
@@ -22,7 +26,7 @@ class Cleaned(NamedTuple):
 
     cloud: Cloud  # its notes say what was done
     stray: NDArray[np.int64]  # rows of the cloud before that were taken out as stray
-    lined: bool = False  # scan lines were thinned out
+    scanned: bool = False  # it lies as scans do: in lines, thinned out now, or with many strays and no great noise
 
 
 def clean_cloud(
@@ -63,4 +67,10 @@ def clean_cloud(
         settled = settled_normals(cloud.points, cloud.normals)
         notes.append(f"normals: {settled.words} (normals=keep)")
         cloud = cloud._replace(normals=settled.normals)
-    return Cleaned(cloud._replace(notes=tuple(notes)), stray, rows is not None)
+    scanned = rows is not None or (len(stray) > MANY * (len(stray) + len(cloud.points)) and is_quiet(cloud.points))
+    return Cleaned(cloud._replace(notes=tuple(notes)), stray, scanned)
+
+
+def is_quiet(points: NDArray[np.float64]) -> bool:
+    """Whether the noise of points (n, 3) is less than 0.45 of their spacing: more of it looks like strays too."""
+    return noise_level(torch.from_numpy(points)) < NOISY * spacing(points)

@@ -70,14 +70,14 @@ def scan(cfg: Any) -> None:
 
     wanted = cfg.ratio if cfg.spacing is None else whole_clouds.ratio_of_spacing(before.points, cfg.spacing)
     count = whole_clouds.output_count(len(before.points), wanted)
-    (cloud, stray, lined), own = _sides.cleaned(cfg, before)
+    (cloud, stray, scanned), own = _sides.cleaned(cfg, before)
     look = describe_cloud(cloud.points, cloud.normals)
     for text in (*cloud.notes, str(look), *look.warnings()):
         say(f"        {text}")
     if cfg.removed is not None:
         gone = {name: values[stray] for name, values in before.attributes.items()}
         io.write_cloud(cfg.removed, before.points[stray], None, gone)
-    network = checkpoints.load(whole_clouds.weights_source("surface", own, lined))
+    network = checkpoints.load(whole_clouds.weights_source("surface", own, scanned))
     for name, value in QUALITIES[cfg.quality].items():
         setattr(network, name, value)
     device = "cuda" if torch.cuda.is_available() else "cpu"

@@ -131,8 +131,8 @@ def upsample(
         raise ValueError(f"density={density}: expected {', '.join(DENSITIES)}")
     if keep not in (True, False, "auto"):
         raise ValueError(f"keep={keep}: expected true, false or auto")
-    given, _, lined = clean_cloud(given, outliers=outliers, lines="keep" if keep is True else lines, signs=signs)
-    network, target = _on_device(*_model(model, given.normals, lined), device)
+    given, _, scanned = clean_cloud(given, outliers=outliers, lines="keep" if keep is True else lines, signs=signs)
+    network, target = _on_device(*_model(model, given.normals, scanned), device)
     upsampler = upsampler_of(network, patch_size)
     if devices > 1 and not getattr(upsampler, "parallel", False):
         raise ValueError(f"devices={devices}: {type(network).__name__} works in one process; leave devices=1")
@@ -289,13 +289,15 @@ def normals(
     return found
 
 
-def weights_source(model: str | PathLike[str], normals: np.ndarray | None, lined: bool = False) -> str | PathLike[str]:
+def weights_source(
+    model: str | PathLike[str], normals: np.ndarray | None, scanned: bool = False
+) -> str | PathLike[str]:
     """What `checkpoint.load` takes, for a cloud with these normals: "surface" means one of three, "newest" a run.
 
-    lined: scan lines of the cloud were thinned out.
+    scanned: it lies as scans do, see `pnu.cleaning.Cleaned`.
     """
     if model == "surface" and normals is None:
-        return "surface_scans" if lined else "surface_estimated"
+        return "surface_scans" if scanned else "surface_estimated"
     return checkpoints.resolve(model)
 
 
@@ -348,12 +350,12 @@ def evaluating(model: object) -> Iterator[None]:
             module.training = True
 
 
-def _model(model: Any, normals: np.ndarray | None, lined: bool) -> tuple[Any, bool]:
+def _model(model: Any, normals: np.ndarray | None, scanned: bool) -> tuple[Any, bool]:
     """The network or upsampler that is meant, and whether it is the caller's own."""
     if not isinstance(model, str | PathLike):
         return model, True
     return (
-        classical(str(model)) if model in CLASSICAL else checkpoints.load(weights_source(model, normals, lined))
+        classical(str(model)) if model in CLASSICAL else checkpoints.load(weights_source(model, normals, scanned))
     ), False
 
 

@@ -156,10 +156,10 @@ def test_scans_have_the_truth_beside_them(kind: str) -> None:
         assert ((toward * scan.clean[:, 3:]).sum(1) > 0).all()  # a sensor sees the side that faces it
 
 
-def test_lined_clouds_take_weights_of_their_own() -> None:
+def test_scanned_clouds_take_weights_of_their_own() -> None:
     cleaned = clean_cloud(Cloud(lines(noise=0.001), None, {}))
-    assert cleaned.lined
-    assert weights_source("surface", None, cleaned.lined) == "surface_scans"
+    assert cleaned.scanned
+    assert weights_source("surface", None, cleaned.scanned) == "surface_scans"
     assert weights_source("surface", None) == "surface_estimated"
     dense = pnu.upsample(lines(noise=0.001), ratio=1)
     inside = (np.abs(dense[:, :2] - 0.5) < 0.45).all(1)
