@@ -13,10 +13,13 @@ FEW = 256  # queries whose order does not matter
 
 
 class PointTree:
-    """The nearest of some points (n, 3), n >= 1, in float64, looked up again and again."""
+    """The nearest of some points (n, 3), n >= 1, in float64, looked up again and again.
+
+    ValueError where points or queries are not finite, or fewer points there are than neighbors asked for.
+    """
 
     def __init__(self, points: NDArray[np.floating]) -> None:
-        self.points = np.asarray(points, np.float64)
+        self.points = finite(points, "points")
         self.compiled = kernels.ready()
         if self.compiled:
             from pnu.kernels.neighbors import NeighborTree
@@ -41,11 +44,14 @@ class PointTree:
         self, queries: NDArray[np.floating], k: int, *, threads: int = 1, ordered: bool = False
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """As `nearest`, but squared distances. ordered: queries come along a curve, which saves time."""
+        queries = finite(queries, "queries")
+        if not 1 <= k <= len(self.points):
+            raise ValueError(f"k: expected 1 to {len(self.points)} neighbors, found {k}")
         if not self.compiled:
             dist, idx = self.plain.query(queries, k=np.arange(1, k + 1), workers=threads)
             return np.multiply(dist, dist, out=dist), idx
         if not ordered and len(queries) > FEW:
-            order = self._order(np.asarray(queries, np.float64))
+            order = self._order(queries)
             back = np.empty_like(order)
             back[order] = np.arange(len(order))
             dist, idx = self.nearest_sq(queries[order], k, threads=threads, ordered=True)
@@ -64,3 +70,11 @@ class PointTree:
         from pnu.kernels.boxes import box_order
 
         return np.asarray(box_order(np.require(queries, np.float64, ["C", "W", "A"]), FEW))
+
+
+def finite(points: NDArray[np.floating], name: str) -> NDArray[np.float64]:
+    """Points in float64; `ValueError` for one that is not finite: compiled searches would go astray."""
+    found = np.asarray(points, np.float64)
+    if not np.isfinite(found).all():
+        raise ValueError(f"{name}: expected finite coordinates, found NaN or infinite ones")
+    return found

@@ -121,6 +121,9 @@ def _float32(points: Tensor) -> Tensor:
 
 def _farthest(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
     """Of equal distances the lowest index, so that all three ways give the same."""
+    if not np.isfinite(xyz).all():  # as in a training that breaks, which is told elsewhere
+        with np.errstate(invalid="ignore"):
+            return _farthest_plain(xyz, m, start)
     if kernels.ready():
         from pnu.kernels.greedy_sampling import farthest_first
 

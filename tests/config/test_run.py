@@ -101,7 +101,7 @@ def test_defaults_are_the_papers() -> None:
         ("modle=pnu", r"unknown key 'modle': did you mean 'model'\?"),
         ("experimnt=quickstart", r"unknown key 'experimnt': did you mean 'experiment'\?"),
         ("+loss.w9=1", r"unknown key 'loss\.w9'"),
-        ("model=foo", r"model=foo: expected one of ecnet, "),
+        ("model=foo", r"model=foo: expected one of densepcr, ecnet, "),
         ("loss.w1=abc", r"loss\.w1=abc: expected float \(weight of the point term"),
         ("trainer.max_steps=1.5", r"trainer\.max_steps=1\.5: expected int \("),
         ("resume=maybe", r"resume=maybe: expected bool \("),

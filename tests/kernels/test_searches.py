@@ -4,6 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+import torch
 
 from pnu.geometry import sampling
 from pnu.geometry.point_tree import PointTree
@@ -97,3 +98,20 @@ def test_farthest_points_of_several_threads() -> None:
         found = list(pool.map(lambda points: sampling._farthest(points, 500, 0), clouds))
     for points, idx in zip(clouds, found, strict=True):
         np.testing.assert_array_equal(idx, sampling._farthest(points, 500, 0))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_is_refused_or_chosen_from_plainly(value: float) -> None:
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    bad = points.copy()
+    bad[50, 1] = value
+    with pytest.raises(ValueError, match=r"points: expected finite coordinates"):
+        PointTree(bad)
+    with pytest.raises(ValueError, match=r"queries: expected finite coordinates"):
+        PointTree(points).nearest(bad, 3)
+    for k in (0, 201):
+        with pytest.raises(ValueError, match=rf"k: expected 1 to 200 neighbors, found {k}"):
+            PointTree(points).nearest(points, k)
+    chosen = sampling.farthest_points(torch.from_numpy(bad)[None].float(), 20)
+    assert chosen.shape == (1, 20)
+    assert ((chosen >= 0) & (chosen < 200)).all()
