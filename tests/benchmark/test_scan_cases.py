@@ -68,6 +68,7 @@ def test_open3ds_chain_makes_as_many_points_with_normals() -> None:
     assert np.abs(np.linalg.norm(dense[:, :3], axis=1) - 1).max() < 0.2
 
 
+@pytest.mark.slow
 def test_the_command_takes_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = ("data=synthetic", "shapes=[mug]", "part=all")
     done = ran(main, tmp_path, "method=midpoint", *data, "kinds=[oneview]", "truth_points=300")

@@ -248,6 +248,7 @@ def notes(capsys: pytest.CaptureFixture[str], command: str, *keys: str) -> str:
     return lines[0] if lines else ""
 
 
+@pytest.mark.slow
 def test_upsample_takes_the_same_keys(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     keys = ("output=dense.ply", "ratio=1.5", "outliers=keep")
     turned = f"normals: 600 given, {(SIGN < 0).sum()} of them turned over ("

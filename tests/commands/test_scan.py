@@ -67,6 +67,7 @@ def test_what_is_wrong_is_said_before_the_work(place: Path, capsys: pytest.Captu
     assert sorted(path.name for path in place.iterdir()) == ["scan.ply"]
 
 
+@pytest.mark.slow
 def test_quiet_prints_nothing(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(["input=scan.ply", "output=mesh.stl", "quiet=true", "ratio=1"])
     assert capsys.readouterr() == ("", "")
@@ -100,6 +101,7 @@ def test_fast_finds_the_same_surface(place: Path, capsys: pytest.CaptureFixture[
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.slow
 def test_a_hole_is_closed_on_request(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     points = bowl(2000)
     write_cloud("scan.ply", points[np.linalg.norm(points - [0, 0, -1], axis=1) > 0.4])

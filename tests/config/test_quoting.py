@@ -227,6 +227,7 @@ def test_from_patches_to_a_picture(say: Say, trained: str) -> None:
     assert Path("picture.png").stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_a_scan_then_a_picture(say: Say) -> None:
     if open3d_error():
         pytest.skip("open3d's system libraries are missing")
@@ -250,6 +251,7 @@ def test_normals_measured_then_made(say: Say) -> None:
     assert read_cloud("with_normals.ply").normals is not None
 
 
+@pytest.mark.slow
 def test_weights_kept_as_a_file(say: Say, trained: str) -> None:
     kept = say(shell_line("export", run=in_nasty("run"), output=in_nasty("w.safetensors")))
     say(printed(kept), "ratio=2")
@@ -306,6 +308,7 @@ def test_a_finished_run_that_lost_its_last_checkpoint(
     assert "start  best validation" in say(line, *data, *SMALL)
 
 
+@pytest.mark.slow
 def test_a_sweep_then_its_report(say: Say, trained: str) -> None:
     folder = Path(in_nasty("sweep"))
     folder.mkdir()

@@ -155,6 +155,7 @@ def test_processes_draw_different_clouds(folder: Path) -> None:
     assert sorted(shapes_of) == sorted([[name] for name in NAMES[:2]])
 
 
+@pytest.mark.slow
 def test_same_clouds_with_a_worker(folder: Path) -> None:
     """Started anew, not forked, as for patches."""
     alone, loaded = (data_module(folder, workers=workers, clouds=4) for workers in (0, 1))

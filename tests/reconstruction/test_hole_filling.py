@@ -35,6 +35,7 @@ def test_a_hole_narrower_than_the_radius_is_filled_and_no_other() -> None:
     assert len(fill_holes(cloud, 5.0)) == 0
 
 
+@pytest.mark.slow
 def test_an_open_border_stays_open() -> None:
     cap = sphere(4000)
     assert len(fill_holes(cap[cap[:, 2] > 0.3], 0.3)) == 0

@@ -110,6 +110,7 @@ def test_trimming_removes_the_bubble_around_an_open_surface() -> None:
         reconstruction.trim(surface, 1)
 
 
+@pytest.mark.slow
 def test_same_input_same_mesh() -> None:
     cloud = sphere_points(500)
     first, second = (reconstruction.reconstruct(cloud[:, :3], cloud[:, 3:]) for _ in range(2))

@@ -241,6 +241,7 @@ def test_logarithmic_axes_hold_their_values_and_have_numbers(low: float, high: f
     assert [float(axis.get_major_formatter()(place)) for place in ticks] == pytest.approx(ticks, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_same_runs_same_bytes_of_the_plots(make: Make) -> None:
     make(8, "a$b$ <i>", 0, 0.4, w3=0.25)  # is no formula
     folder = three_settings(make)
@@ -306,6 +307,7 @@ def browse(page: Path, profile: Path, *action: str) -> subprocess.CompletedProce
 
 
 @needs_browser
+@pytest.mark.slow
 def test_page_in_a_browser(swept: Path, tmp_path: Path) -> None:
     page = (swept / "report" / "report.html").read_text()
     assert not re.findall(r'(?:src|href)="(?!data:|#)', page)

@@ -39,6 +39,7 @@ def work(cloud: Tensor, part: Tensor) -> Tensor:
     return torch.cat([cloud[part], cloud.new_full((1, 3), os.getpid())])
 
 
+@pytest.mark.slow
 def test_order_errors_and_end() -> None:
     parts = list(torch.arange(4).split(1))
     with Processes(nn.Identity(), ["cpu", "cpu"]) as workers:

@@ -334,6 +334,7 @@ def test_a_run_goes_on_from_every_checkpoint_as_if_never_stopped(
             assert ours == theirs, (copy, name)
 
 
+@pytest.mark.slow
 def test_a_finished_run_can_be_made_longer(train: Train) -> None:
     run = train("trainer.max_epochs=1")
     before = record(run)
@@ -361,6 +362,7 @@ def test_a_run_that_ended_within_an_epoch_can_be_made_longer(train: Train, steps
     assert same(weights(run), weights(train(*options, "trainer.max_steps=6", run="whole")))
 
 
+@pytest.mark.slow
 def test_a_run_without_checkpoint_starts_again(train: Train, capsys: pytest.CaptureFixture[str]) -> None:
     run = train("trainer.max_epochs=1")
     final = weights(run)
@@ -405,6 +407,7 @@ def test_a_run_of_an_older_version_goes_on(train: Train) -> None:
     assert yaml.safe_load((run / "config.yaml").read_text())["objective"] is None
 
 
+@pytest.mark.slow
 def test_what_a_run_has_learnt_cannot_change(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     error = refused(capsys, main, [f"run={finished}", "resume=true", "loss.w1=2"])
     assert "loss.w1=2: a run that goes on keeps its config; what may change: run, resume, quiet" in error
