@@ -73,12 +73,14 @@ def evaluate(cfg: Any) -> None:
     from pnu.metrics import ray_casting
     from pnu.networks import checkpoints
     from pnu.training.run_folder import run_name
-    from pnu.upsamplers import classical
+    from pnu.upsamplers import CLASSICAL, classical
 
     protocol, source = protocol_source(cfg)
     find = functools.partial(find_metric, allow=cfg.allow)
     chosen = protocol.metrics(metrics.with_own(cfg.metrics, find, benchmark.of_kinds(source.kinds)))
     subject = cfg.method or str(checkpoints.resolve(cfg.run or DEFAULT[cfg.normals]))
+    if cfg.method not in (None, "open3d", *CLASSICAL):
+        raise ValueError(f"method={cfg.method}: expected one of {', '.join(CLASSICAL)} or open3d")
     if cfg.method == "open3d":
         upsampler = benchmark.open3d_chain(cfg.ratio, cfg.seed)
     else:
