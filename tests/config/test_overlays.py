@@ -22,6 +22,7 @@ OVERLAYS = [
     for path in sorted((config_folder() / group).rglob("*.yaml"))
 ]
 EXPERIMENTS = [overlay for overlay in OVERLAYS if overlay.startswith(("experiment", "scale"))]
+UPSAMPLING = [overlay for overlay in EXPERIMENTS if overlay != "experiment=normals"]  # a task with data of its own
 
 
 @pytest.mark.parametrize("overlay", OVERLAYS)
@@ -113,7 +114,7 @@ def test_quickstart_takes_patches_of_ones_own(patches: Path, capsys: pytest.Capt
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("overlay", EXPERIMENTS)
+@pytest.mark.parametrize("overlay", UPSAMPLING)
 @pytest.mark.parametrize("source", ["own", "patches", "surface"])
 def test_every_experiment_runs_a_step(overlay: str, source: str, patches: Path, tmp_path: Path) -> None:
     meshes = tmp_path / "meshes"
@@ -140,3 +141,22 @@ def test_every_experiment_runs_a_step(overlay: str, source: str, patches: Path, 
     chosen = [] if source == "own" else [f"data={source}"]
     main([overlay, *chosen, *options, f"run={tmp_path / 'run'}", "quiet=true"])
     assert finished(tmp_path / "run")
+
+
+@pytest.mark.slow
+def test_the_experiment_of_normals_runs_a_step(tmp_path: Path) -> None:
+    data = ["data.clouds=2", "data.points=300", "data.queries=4", "data.batch_size=1"]
+    steps = ["trainer.max_steps=1", "trainer.val_check_interval=1", "trainer.limit_val_batches=1"]
+    run = tmp_path / "run"
+    main(
+        [
+            "experiment=normals",
+            *data,
+            *steps,
+            "trainer.limit_test_batches=1",
+            "threads=null",
+            f"run={run}",
+            "quiet=true",
+        ]
+    )
+    assert finished(run)
