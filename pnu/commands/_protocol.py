@@ -8,6 +8,11 @@ from pnu.config.instantiate import PACKAGES, instantiate
 if TYPE_CHECKING:
     from pnu.benchmark import CaseSource, Protocol
 
+KINDS = (
+    "of input: uniform, random, nonuniform, sparse (a quarter of the points), noise_0.5, noise_1, noise_2; "
+    "simulated scans: orbit, oneview, lines, photo, flipped; null: the protocol's"
+)
+
 
 def protocol_source(cfg: Any) -> tuple["Protocol", "CaseSource"]:
     """The protocol, and the cases that it makes of `data`; keys of the command go before what the protocol says."""

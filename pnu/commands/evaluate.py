@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from pnu.commands._entry import command
 from pnu.commands._normal_task import evaluate_task
-from pnu.commands._protocol import protocol_source
+from pnu.commands._protocol import KINDS, protocol_source
 from pnu.config.instantiate import find_metric
 from pnu.config.quoting import shell_line
 from pnu.config.schema import Group, doc
@@ -38,10 +38,7 @@ class Evaluate:
     part: str | None = doc("of the shapes: train, val, test, all; null: test of the procedural ones, all of a folder")
     shapes: list[str] | None = doc("names of the shapes to take; null: all of the part")
     protocol: Group = doc("Protocol: sampling, frame, definitions")
-    kinds: list[str] | None = doc(
-        "of input: uniform, random, nonuniform, sparse (a quarter of the points), noise_0.5, noise_1, noise_2; "
-        "simulated scans: orbit, oneview, lines, photo, flipped; null: the protocol's"
-    )
+    kinds: list[str] | None = doc(KINDS)
     points: int | None = doc("points of an input cloud; null: the protocol's")
     truth_points: int | None = doc("points on the true surface to compare with; null: the protocol's")
     columns: str | None = doc(
