@@ -18,7 +18,6 @@ from pnu.io import Mesh
 LEAST, MOST = 600, 8000  # points of a cloud, evenly spread in the logarithm, for half of the clouds
 USUAL = (1500, 6500)  # and for the other half
 SMALLEST = 16  # points of a crop, or of a cloud for validation, from which surfaces can be told
-MARGIN = 32  # points beyond a crop that its estimated normals need
 TAKEN = 0.015  # distance from the surface up to which a point of a scan is taken for a measurement of it,
 OVERLOOKED = 0.03  # and the share of the others that stay, as where they are removed by their looks
 GIVEN = 0.3  # share of the crops that have true normals where normals="mixed"
@@ -74,8 +73,8 @@ class Crops(Dataset[dict[str, Any]]):
             clean, noisy = self.scanned(self.scanners[shape], rng)
         else:
             clean, noisy = self.cloud(self.meshes[shape], rng)
-        rough = rough_normals(noisy[:, :3], clean[:, 3:]) if self.mixed else None
-        views = [self.crop(clean, noisy, rng, rough) for _ in range(self.views)]
+        rough = rough_normals(noisy[:, :3], clean[:, 3:]) if self.estimated else noisy[:, 3:]
+        views = [self.crop(clean, noisy, rough, rng) for _ in range(self.views)]
         return {
             **stacked_items(views),
             "index": torch.full((self.views,), shape),
@@ -83,24 +82,18 @@ class Crops(Dataset[dict[str, Any]]):
         }
 
     def crop(
-        self, clean: np.ndarray, noisy: np.ndarray, rng: np.random.Generator, rough: np.ndarray | None = None
+        self, clean: np.ndarray, noisy: np.ndarray, rough: np.ndarray, rng: np.random.Generator
     ) -> dict[str, Any]:
         """Input and target (size, 6) around a random point, with the normals of a random side.
 
-        Those of the input are given or estimated, in the crop alone or as `rough` (n, 3) in the whole cloud.
+        Those of the input are `rough` (n, 3), or true in some crops where they are mixed.
         """
         center = noisy[rng.integers(len(noisy)), :3]
-        size = min(self.size + (MARGIN if self.estimated and rough is None else 0), len(noisy))
         distance = np.linalg.norm(noisy[:, :3] - center, axis=1)
-        near = np.argpartition(distance, size - 1)[:size]
+        near = np.argpartition(distance, self.size - 1)[: self.size]
         near = near[np.argsort(distance[near])]
-        if rough is not None:
-            normals = noisy[near, 3:] if rng.random() < GIVEN else rough[near]
-        elif self.estimated:
-            normals = rough_normals(noisy[near, :3], clean[near, 3:])
-        else:
-            normals = noisy[near, 3:]
-        near, normals = near[: self.size], normals[: self.size]
+        true = self.mixed and rng.random() < GIVEN
+        normals = noisy[near, 3:] if true else rough[near]
         side = -1.0 if rng.random() < 0.3 else 1.0
         crop = np.hstack([noisy[near, :3] - center, side * normals])
         target = np.hstack([clean[near, :3] - center, side * clean[near, 3:]])
@@ -119,7 +112,7 @@ class Crops(Dataset[dict[str, Any]]):
             rows = thinned_lines(points)
             if rows is not None:
                 points, clean = averaged(points, rows), clean[rows]
-            if len(points) >= self.least + MARGIN:
+            if len(points) >= self.least:
                 return clean, np.hstack([points, clean[:, 3:]])
 
     def cloud(self, mesh: Mesh, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -89,6 +89,8 @@ class Surface(nn.Module):
         queries: seeds of a crop, in training
         smoothing: share of the crops in training whose inner points are themselves projected first, as those of a noisy
             cloud are at work
+        refining: share of the crops in training whose inner points get the network's own normals first
+        passes: at work, times that the normals of the cloud are replaced by those that the network finds at its points
         sphere: start from the sphere that fits the neighbors (algebraic point set surface), not from the seed
         attention: weigh the neighbors; without it all count alike
     """
@@ -101,7 +103,8 @@ class Surface(nn.Module):
         self, ratio: int = 4, neighbors: int = 24, reach: int = 24, width: int = 64, rounds: int = 2,
         seeds: float = 4, candidates: float = 2, shortlist: float = 1.15,
         relaxation: int = 2, refinements: int = 2, reject: float = 0.003,
-        queries: int = 64, smoothing: float = 0.0, sphere: bool = True, attention: bool = True,
+        queries: int = 64, smoothing: float = 0.0, refining: float = 0.0, passes: int = 0,
+        sphere: bool = True, attention: bool = True,
     ) -> None:  # fmt: skip
         super().__init__()
         self.ratio, self.neighbors, self.reach, self.rounds = ratio, neighbors, reach, rounds
@@ -114,9 +117,12 @@ class Surface(nn.Module):
         for name in ("rounds", "seeds", "candidates", "shortlist", "refinements", "queries"):
             if getattr(self, name) < 1:  # too few seeds would be too few points
                 raise ValueError(f"model.{name}={getattr(self, name)}: expected at least 1")
-        if not 0 <= smoothing <= 1:
-            raise ValueError(f"model.smoothing={smoothing}: expected a share from 0 to 1")
-        self.smoothing = smoothing
+        for name, share in (("smoothing", smoothing), ("refining", refining)):
+            if not 0 <= share <= 1:
+                raise ValueError(f"model.{name}={share}: expected a share from 0 to 1")
+        if passes < 0:
+            raise ValueError(f"model.passes={passes}: expected 0 or more")
+        self.smoothing, self.refining, self.passes = smoothing, refining, passes
         self.projector = Projector(width, sphere=sphere, attention=attention)
 
     def check_input(self, key: str, points: int) -> None:
@@ -133,7 +139,7 @@ class Surface(nn.Module):
         "query" and "projected" (rounds, B, queries, 6) before and after each round, "log_error" and "spacing"
         (rounds, B, queries); "prediction" is the last of "projected". A query has no gradient.
         """
-        patch = self.with_some_smoothed(patch)
+        patch = self.with_some_smoothed(self.with_some_refined(patch))
         query, outward = self.training_seeds(patch)
         found: list[tuple[Tensor, ...]] = []
         for _ in range(self.rounds):
@@ -152,6 +158,21 @@ class Surface(nn.Module):
             return patch
         smooth, _, _ = self.project(patch[:some, :inner], patch[:some])
         return torch.cat([torch.cat([smooth, patch[:some, inner:]], 1), patch[some:]])
+
+    @torch.no_grad()
+    def with_some_refined(self, patch: Tensor) -> Tensor:
+        """Patches (B, n, 6), the nearer half of the points of the last with normals found by the network.
+
+        A share of `refining` gets them, half of these twice.
+        """
+        inner = patch.shape[1] // 2
+        for share in (self.refining, self.refining / 2):
+            plain = len(patch) - round(share * len(patch))
+            if plain < len(patch):
+                found, _, _ = self.project(patch[plain:, :inner], patch[plain:])
+                patch = patch.clone()
+                patch[plain:, :inner, 3:] = found[..., 3:]
+        return patch
 
     def training_seeds(self, patch: Tensor) -> tuple[Tensor, Tensor]:
         """Seeds around the first points of patches (B, n, 6), (B, queries, 6), and a push of each, (B, queries, 6).

@@ -60,6 +60,8 @@ class SurfaceProjection:
         """
         if count >= LONG and cloud.device.type == "cpu":
             compile_in_background()
+        for number in range(1, self.network.passes + 1):
+            cloud = self.with_normals(cloud, cloud, context, f"normals, pass {number}")
         if noise_in_spacings(cloud) > SMOOTH:
             smooth, _ = self.projected(cloud, cloud, context, "smoothing, the points are noisy")
             measured, cloud = cloud, smooth
@@ -118,9 +120,11 @@ class SurfaceProjection:
             project, query, cloud, workers=context.workers or InProcess(self.network), context=context, stage=stage
         )
 
-    def with_normals(self, kept: Tensor, cloud: Tensor, context: Context) -> Tensor:
+    def with_normals(
+        self, kept: Tensor, cloud: Tensor, context: Context, stage: str = "normals of the points kept"
+    ) -> Tensor:
         """Points (k, 6) with the normals that the network finds at their places."""
-        there, _ = self.projected(kept, cloud, context, "normals of the points kept")
+        there, _ = self.projected(kept, cloud, context, stage)
         return torch.cat([kept[:, :3], there[:, 3:]], 1)
 
 
