@@ -19,6 +19,7 @@ from pnu.geometry.jet_normals import jet_normals
 from pnu.geometry.normal_estimation import estimate_normals, orient_normals
 from pnu.io import Mesh
 from pnu.metrics.normal_scores import normal_scores
+from pnu.upsamplers.whole_clouds import normals
 
 PUBLISHED_NORMALS = Path(__file__).with_name("published_normals.csv")
 Estimator = Callable[[np.ndarray], np.ndarray]
@@ -33,7 +34,7 @@ COLUMNS = {
 
 
 def estimators(neighbors: int = 24) -> dict[str, Estimator]:
-    """PCA and jets, both oriented as pnu orients, and pnu's own estimate."""
+    """PCA and jets, both oriented as pnu orients; plane fits within each sheet; `pnu.normals`, learned, from there."""
 
     def oriented(lines: Callable[[torch.Tensor], torch.Tensor]) -> Estimator:
         def estimate(points: np.ndarray) -> np.ndarray:
@@ -45,7 +46,8 @@ def estimators(neighbors: int = 24) -> dict[str, Estimator]:
     return {
         "pca": oriented(lambda cloud: estimate_normals(cloud, neighbors, orient=False)),
         "jets": oriented(lambda cloud: jet_normals(cloud, neighbors)),
-        "pnu": lambda points: estimate_normals(torch.from_numpy(points)[None])[0].numpy(),
+        "planes": lambda points: estimate_normals(torch.from_numpy(points)[None])[0].numpy(),
+        "pnu": normals,
     }
 
 

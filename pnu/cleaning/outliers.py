@@ -22,6 +22,11 @@ PIECE = 12  # points below which a piece that stands apart is stray
 APART = 6.0  # usual spacings between a piece and all others
 EVEN = 0.45  # breadth of the middle 80 % of nearest distances over their median, below which points keep a distance
 FITS = (0.6, 1.6)  # nearest distances over those around, of points that fit into such an order
+BESIDE, LEVEL = (
+    1.3,
+    0.9,
+)  # local spacings to the nearest point that stays, and to the plane of its own, of one that fits
+AROUND = 12  # points that such a plane goes through
 FEWEST = 64  # points of a cloud in which strays can be told
 
 
@@ -37,7 +42,7 @@ def detector() -> OutlierDetector:
 
 
 def stray_points(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which of the points (n, 3) are stray, (n,): by the detector, then pieces of a few points that stand apart.
+    """Which of the points (n, 3) are stray, (n,): by the detector, but for those that fit in; then small pieces.
 
     Rows may be in any order; place, rotation and size have no influence. Clouds of fewer than 64 points have none.
     """
@@ -54,10 +59,30 @@ def stray_points(points: NDArray[np.float64]) -> NDArray[np.bool_]:
         stays[rows[stray]] = False
         if not stray.any():
             break
+    if stays.sum() >= FEWEST and not stays.all():
+        stays[~stays] = continue_surface(points[~stays], points[stays])
     rows = np.flatnonzero(stays)
     if len(rows) >= FEWEST:
         stays[rows[small_pieces(points[rows])]] = False
     return ~stays
+
+
+def continue_surface(points: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which points (m, 3) lie beside others (n, 3) and in the plane that those make there, (m,).
+
+    Where a cloud thins out the detector takes its last points for stray; they are none.
+    """
+    tree, count = PointTree(others), torch.get_num_threads()
+    distance, near = tree.nearest(points, AROUND, threads=count)
+    some = near[:, : AROUND // 2]
+    spacing = tree.nearest(others[some].reshape(-1, 3), 7, threads=count)[0][:, 1:].reshape(*some.shape, 6).mean((1, 2))
+    around = others[near]
+    center = around.mean(1)
+    offsets = around - center[:, None]
+    normal = np.linalg.eigh(offsets.swapaxes(1, 2) @ offsets)[1][:, :, 0]
+    rise = np.abs(((points - center) * normal).sum(1))
+    fits: NDArray[np.bool_] = (distance[:, 0] < BESIDE * spacing) & (rise < LEVEL * spacing)
+    return fits
 
 
 def fit_in_order(points: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -32,11 +32,12 @@ def check_sides(cfg: Any) -> None:
         raise ValueError(f"{name}={cfg[name]}: decides nothing where normals=keep; take normals=orient")
 
 
-def sided(cfg: Any, cloud: "Cloud") -> tuple["Cloud", str]:
+def sided(cfg: Any, cloud: "Cloud", *, learned: bool = True) -> tuple["Cloud", str]:
     """A cloud with a normal for each point, as the keys and the file say, and a line on them, which is the last of its
-    notes where something was done."""
+    notes where something was done. Without `learned` those that are estimated are plane fits."""
     from pnu.geometry.cloud_normals import settled_normals
     from pnu.io.sensor import asked_sight, sight_of
+    from pnu.upsamplers.learned_normals import learned_normals
 
     with stages(cfg.quiet) as progress:
         settled = settled_normals(
@@ -45,6 +46,7 @@ def sided(cfg: Any, cloud: "Cloud") -> tuple["Cloud", str]:
             choice=cfg.normals,
             asked=asked_sight(cfg.viewpoint, cfg.up, cfg.side),
             found=sight_of(cfg.input, cloud.attributes),
+            refine=learned_normals if learned else None,
             progress=progress,
         )
     line = f"normals: {settled.words}"
@@ -64,4 +66,4 @@ def cleaned(cfg: Any, cloud: "Cloud", **treatments: Any) -> tuple["Cleaned", "ND
     told = told or sight_of(cfg.input, cloud.attributes) is not None or is_height_map(cloud.points)
     found = clean_cloud(cloud, **treatments, signs="keep" if told or cfg.normals == "keep" else "auto")
     own = found.cloud.normals
-    return (found._replace(cloud=sided(cfg, found.cloud)[0]) if told else found), own
+    return (found._replace(cloud=sided(cfg, found.cloud, learned=False)[0]) if told else found), own

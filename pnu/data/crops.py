@@ -81,9 +81,7 @@ class Crops(Dataset[dict[str, Any]]):
             "shape": [self.names[shape]] * self.views,
         }
 
-    def crop(
-        self, clean: np.ndarray, noisy: np.ndarray, rough: np.ndarray, rng: np.random.Generator
-    ) -> dict[str, Any]:
+    def crop(self, clean: np.ndarray, noisy: np.ndarray, rough: np.ndarray, rng: np.random.Generator) -> dict[str, Any]:
         """Input and target (size, 6) around a random point, with the normals of a random side.
 
         Those of the input are `rough` (n, 3), or true in some crops where they are mixed.

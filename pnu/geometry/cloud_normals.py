@@ -1,5 +1,6 @@
 """Normals of a whole cloud: whose axes are taken, what decides their side, and what is to be said of it."""
 
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -15,6 +16,8 @@ from pnu.io.sensor import Sight
 from pnu.runtime.progress import Progress, silent
 
 Choice = Literal["auto", "estimate", "orient", "keep"]
+Refine = Callable[[torch.Tensor, torch.Tensor, Progress], torch.Tensor]
+"""points (n, 3) in the unit sphere, rough normals (n, 3) whose sides agree -> better ones (n, 3)."""
 OUTWARD = "outward, by the winding field"
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -35,6 +38,7 @@ def settled_normals(
     asked: Sight | None = None,
     found: Sight | None = None,
     neighbors: int = 16,
+    refine: Refine | None = None,
     progress: Progress = silent,
 ) -> Settled:
     """A unit normal for each of different points (n, 3); neither their order nor their unit matters.
@@ -46,6 +50,7 @@ def settled_normals(
         asked: what shall decide the side of all that are not kept.
         found: what the file says; it decides where nothing is asked and given signs don't agree, or there are none.
         neighbors: of the plane fits that estimates begin with.
+        refine: what makes better ones of those that are estimated.
         progress: called as progress(stage, done, total).
 
     Raises:
@@ -66,6 +71,9 @@ def settled_normals(
         raise ValueError(f"points: all {len(points)} points lie on a line; expected points on a surface")
     progress("normals", 0, 1)
     lines = complete_normals(unit, None if given is None else torch.from_numpy(given), neighbors)
+    if refine is not None and not known.all():
+        missing = torch.from_numpy(~known)[:, None]
+        lines = torch.where(missing, refine(unit, lines, progress), lines)
     sight = asked or found or (Sight("up, as a map of heights", up=UP) if is_height_map(points) else None)
     if sight is not None and sight.viewpoint is not None:
         center, scale = frame.center[0, 0].numpy(), float(frame.scale)

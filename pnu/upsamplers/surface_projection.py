@@ -60,8 +60,7 @@ class SurfaceProjection:
         """
         if count >= LONG and cloud.device.type == "cpu":
             compile_in_background()
-        for number in range(1, self.network.passes + 1):
-            cloud = self.with_normals(cloud, cloud, context, f"normals, pass {number}")
+        cloud = self.with_refined_normals(cloud, self.network.passes, context)
         if noise_in_spacings(cloud) > SMOOTH:
             smooth, _ = self.projected(cloud, cloud, context, "smoothing, the points are noisy")
             measured, cloud = cloud, smooth
@@ -119,6 +118,12 @@ class SurfaceProjection:
         return in_parts(
             project, query, cloud, workers=context.workers or InProcess(self.network), context=context, stage=stage
         )
+
+    def with_refined_normals(self, cloud: Tensor, passes: int, context: Context) -> Tensor:
+        """A cloud (n, 6) with the normals that the network finds at its points, so many times one after the other."""
+        for number in range(1, passes + 1):
+            cloud = self.with_normals(cloud, cloud, context, f"normals, pass {number}")
+        return cloud
 
     def with_normals(
         self, kept: Tensor, cloud: Tensor, context: Context, stage: str = "normals of the points kept"

@@ -31,6 +31,7 @@ from pnu.runtime.progress import Progress, silent
 from pnu.runtime.workers import Processes
 from pnu.upsamplers import CLASSICAL, Context, Upsampler, classical, upsampler_of
 from pnu.upsamplers.density import DENSITIES, Density, count_of_spacing
+from pnu.upsamplers.learned_normals import learned_normals
 from pnu.upsamplers.patches import with_unit_normals
 from pnu.upsamplers.surface_projection import is_clean_and_even
 
@@ -282,7 +283,9 @@ def normals(
         raise ValueError(
             f"neighbors={neighbors}: expected a whole number from 3 to {len(cloud.points)}, the different points"
         )
-    settled = settled_normals(cloud.points, cloud.normals, asked=asked, neighbors=int(neighbors), progress=progress)
+    settled = settled_normals(
+        cloud.points, cloud.normals, asked=asked, neighbors=int(neighbors), refine=learned_normals, progress=progress
+    )
     finite = np.isfinite(array).all(1)
     found = np.full(array.shape, np.nan)
     found[finite] = settled.normals[cKDTree(cloud.points).query(array[finite])[1]]  # each point is one of them

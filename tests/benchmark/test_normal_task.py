@@ -87,11 +87,11 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "Nesti-Net" not in measured
     rows = read_json(tmp_path / "out" / "metrics.json")["rows"]
     assert {(row["kind"], row["method"]) for row in rows} == {
-        (kind, method) for kind in ("clean", "gradient") for method in ("pca", "jets", "pnu")
+        (kind, method) for kind in ("clean", "gradient") for method in ("pca", "jets", "planes", "pnu")
     }
     assert all(row["flipped"] == 0 and row["oriented_rms_deg"] < 15 for row in rows if row["kind"] == "clean")
     for arguments, message in (
-        (["method=apss"], "method=apss: expected pca, jets, pnu with task=normals"),
+        (["method=apss"], "method=apss: expected pca, jets, planes, pnu with task=normals"),
         (["kinds=[uniform]"], "kinds=uniform: expected some of clean, noise_0.12"),
         (["run=pnu"], "run=pnu: is no network of normals, which task=normals trains"),
     ):

@@ -275,6 +275,35 @@ def test_count_is_exact_however_many_are_dropped(count: int) -> None:
     assert stays.equal(stays.unique())
 
 
+def test_some_crops_in_training_get_normals_of_the_network_s_own() -> None:
+    network = trained(neighbors=8, reach=8, queries=8, refining=0.5)
+    patch = torch.stack([wavy(60, seed) for seed in range(4)])
+    refined = network.with_some_refined(patch)
+    changed = (refined != patch).any(2)
+    assert not changed[:2].any()
+    assert changed[2:, :30].all()
+    assert not changed[2:, 30:].any()
+    torch.testing.assert_close(refined[..., :3], patch[..., :3], rtol=0, atol=0)
+    once, _, _ = network.project(patch[2:3, :30], patch[2:3])
+    torch.testing.assert_close(refined[2:3, :30, 3:], once[..., 3:])
+    assert trained(neighbors=8, reach=8, queries=8).with_some_refined(patch) is patch
+
+
+def test_normals_of_bare_clouds_are_refined_before_the_work() -> None:
+    cloud, seen = wavy(300), []
+    network = trained(neighbors=8, reach=8, passes=2)
+    rough = torch.cat(
+        [cloud[:, :3], torch.nn.functional.normalize(cloud[:, 3:] + 0.3 * torch.sin(9 * cloud[:, :3]))], 1
+    )
+    found = upsample(network, rough, 600, progress=lambda stage, *_: seen.append(stage))
+    assert [f"normals, pass {n}" in seen for n in (1, 2, 3)] == [True, True, False]
+    network.passes = 0
+    refined = rough
+    for _ in range(2):
+        refined = torch.cat([cloud[:, :3], network.project(refined[None], refined[None])[0][0, :, 3:]], 1)
+    torch.testing.assert_close(upsample(network, refined, 600), found, atol=1e-6, rtol=0)
+
+
 def test_noisy_points_are_smoothed_first() -> None:
     """Of a cloud that is noisy beside its spacing, and of no other."""
     model, stages = Surface(), set()
