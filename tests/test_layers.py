@@ -30,7 +30,7 @@ ROOMS = [
         "fast",
         "rendering",
     ),
-    *("reconstruction", "upsamplers", "training", "benchmark", "report", "commands", "train", "__main__"),
+    *("reconstruction", "upsamplers", "training", "benchmark", "report", "app", "commands", "train", "__main__"),
 ]
 HEAVY = {"torch", "lightning", "hydra", "open3d", "tensorboard", "torchmetrics", "scipy", "h5py", "trimesh", "numba"}
 

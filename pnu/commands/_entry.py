@@ -65,7 +65,7 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
     Args:
         function: gets the checked config; its `ValueError`s and `OSError`s become one line and exit code 2.
         schema: dataclass that documents every key of `conf/<name>.yaml`; `also` of it: other names of keys; `commas`:
-            keys whose values hold commas.
+            keys whose values hold commas; `files`: the key of the files that stand alone, as in `pnu view a.ply b.ply`.
         name: of the config file; default: the schema's name in lower case.
     """
     name = name or schema.__name__.lower()
@@ -96,6 +96,7 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
             renamed(argument, getattr(schema, "also", {}), getattr(schema, "commas", ()))
             for argument in (sys.argv[1:] if argv is None else argv)
         ]
+        given = files_first(given, getattr(schema, "files", None))
         arguments = sorted(given, key=is_override)
         if "--version" in arguments:  # Hydra would tell its own
             print(f"pnu {__version__}")
@@ -209,6 +210,16 @@ def folder_arguments(config: Any, schema: type) -> list[str]:
 def is_override(argument: str) -> bool:
     """Whether an argument sets a key, and is no option."""
     return not argument.startswith("-") and ("=" in argument or argument.startswith("~"))
+
+
+def files_first(given: Sequence[str], key: str | None) -> list[str]:
+    """The arguments, those that are neither an option nor `key=value` as one list of that key."""
+    if key is None:
+        return [*given]
+    alone = [argument for argument in given if not argument.startswith(("-", "~")) and "=" not in argument]
+    alone = [str(Path(argument).expanduser()) for argument in alone]
+    rest = [argument for argument in given if argument.startswith(("-", "~")) or "=" in argument]
+    return [*([quoting.override(key, alone)] if alone else []), *rest]
 
 
 def renamed(argument: str, names: Mapping[str, str], commas: Sequence[str] = ()) -> str:

@@ -9,14 +9,14 @@ Array = NDArray[np.float64]
 
 
 class Camera(NamedTuple):
-    """An orthographic camera. View coordinates: x right, y up, z towards the viewer; the picture spans -1..1."""
+    """An orthographic camera. ShapeView coordinates: x right, y up, z towards the viewer; the picture spans -1..1."""
 
     rotation: Array  # (3, 3), rows: right, up, towards the viewer
     center: Array  # (3,) the point in the middle of the picture
     half_size: float  # half the picture's side, in units of the points
 
     def view(self, points: np.ndarray) -> Array:
-        """View coordinates `(n, 3)` of points `(n, 3)`."""
+        """ShapeView coordinates `(n, 3)` of points `(n, 3)`."""
         return (points - self.center) @ self.rotation.T / self.half_size
 
 

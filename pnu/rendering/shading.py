@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from pnu.rendering.colors import linear_light, srgb
 
-# View coordinates: x right, y up, z to the viewer. (direction to the light, strength)
+# ShapeView coordinates: x right, y up, z to the viewer. (direction to the light, strength)
 LIGHTS = (((-0.55, 0.60, 0.58), 0.80), ((0.90, 0.05, 0.43), 0.12))
 SKY, GROUND = 0.30, 0.10  # light from above and below that reaches an open surface
 GLOSS, SHARPNESS = 0.10, 24.0

@@ -15,7 +15,7 @@ import numpy as np
 from pnu.io import atomic_path
 from pnu.rendering.colors import value_colors
 from pnu.report.html_tables import Cell, Column, Line, Row, Set, Table, sort_key, typeset
-from pnu.report.viewer_data import Drawing, View, encode
+from pnu.report.viewer_data import Drawing, ShapeView, encode
 
 __all__ = [
     "Cell",
@@ -24,8 +24,8 @@ __all__ = [
     "Line",
     "Row",
     "Set",
+    "ShapeView",
     "Table",
-    "View",
     "data_url",
     "render",
     "sort_key",
@@ -38,13 +38,14 @@ def write_page(
     path: str | Path,
     title: str,
     tables: Mapping[str, Sequence[Table]],
-    views: Sequence[View] = (),
+    views: Sequence[ShapeView] = (),
     *,
     head: Sequence[str] = (),
     foot: Sequence[str] = (),
     views_note: str = "",
     figures: Mapping[str, bytes] | None = None,
     colormap: str = "error",
+    pick: Mapping[str, Any] | None = None,
 ) -> int:
     """Write the page of a comparison atomically; returns its size in bytes.
 
@@ -54,10 +55,11 @@ def write_page(
         head, foot: paragraphs of plain text.
         figures: caption -> PNG or WebP.
         colormap: of errors, as in `pnu.rendering.colors`.
+        pick: what the viewer shows first: mode (normals, errors, plain, colors), up (x, y, z), form, shape, kind, item.
     """
     from markupsafe import Markup
 
-    scale = value_colors(np.linspace(0, 1, 16), (0, 1), colormap)
+    scale = color_scale(colormap)
     stored = json.dumps([encode(view) for view in views]).replace("<", "\\u003c")  # nothing ends the element
     text = render(
         "comparison.html",
@@ -67,13 +69,24 @@ def write_page(
         foot=foot,
         views_note=views_note,
         pictures={caption: data_url(picture) for caption, picture in (figures or {}).items()},
-        gradient=f"linear-gradient(to right, {', '.join(f'rgb({r} {g} {b})' for r, g, b in scale)})",
+        gradient=gradient(scale),
         colors=Markup(json.dumps([round(float(v), 4) for v in scale.ravel() / 255])),
         views=Markup(stored),
+        pick=Markup(json.dumps(dict(pick or {})).replace("<", "\\u003c")),
     )
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return len(text.encode())
+
+
+def color_scale(colormap: str = "error") -> np.ndarray:
+    """The sixteen colors (16, 3) of errors that the viewer mixes."""
+    return value_colors(np.linspace(0, 1, 16), (0, 1), colormap)
+
+
+def gradient(scale: np.ndarray) -> str:
+    """The same as a background of CSS."""
+    return f"linear-gradient(to right, {', '.join(f'rgb({r} {g} {b})' for r, g, b in scale)})"
 
 
 def render(template: str, **values: Any) -> str:

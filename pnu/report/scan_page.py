@@ -7,7 +7,7 @@ import numpy as np
 
 from pnu.io import Cloud, Mesh
 from pnu.report.offline_page import write_page
-from pnu.report.viewer_data import Drawing, View
+from pnu.report.viewer_data import Drawing, ShapeView
 
 MOST = 60_000  # points of a cloud that is drawn
 FEWEST = 8  # points that have a spacing
@@ -45,7 +45,7 @@ def write_scan_page(
         path,
         name,
         {},
-        [View(name, "scan", drawings, center, radius, 1.0)],
+        [ShapeView(name, "scan", drawings, center, radius, 1.0)],
         head=[counts, *notes],
         views_note="" if largest <= MOST else f"Of clouds with more than {MOST} points, every k-th is shown.",
     )

@@ -89,7 +89,7 @@ def error_limit(errors: Sequence[np.ndarray]) -> float:
     return float(np.median([typical_limit(error) for error in errors])) if errors else 1e-2
 
 
-def view(shown: ShownCase, rebuilt: Mapping[str, Rebuilt], points: int) -> offline_page.View:
+def view(shown: ShownCase, rebuilt: Mapping[str, Rebuilt], points: int) -> offline_page.ShapeView:
     """For the page's viewer: at most `points` points of each cloud, every k-th."""
     truth = shown.case.truth
     drawings, errors = [], []
@@ -107,7 +107,7 @@ def view(shown: ShownCase, rebuilt: Mapping[str, Rebuilt], points: int) -> offli
     )
     if rebuilt:
         errors = [surface.errors.distance for name, surface in rebuilt.items() if name != "input"]
-    return offline_page.View(truth.shape, shown.case.kind, drawings, np.zeros(3), 1.0, error_limit(errors))
+    return offline_page.ShapeView(truth.shape, shown.case.kind, drawings, np.zeros(3), 1.0, error_limit(errors))
 
 
 def thinned(cloud: np.ndarray, points: int) -> np.ndarray:

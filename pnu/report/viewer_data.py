@@ -22,9 +22,11 @@ class Drawing(NamedTuple):
     cloud_error: np.ndarray | None = None  # (n,)
     surface: Mesh | None = None
     surface_error: np.ndarray | None = None  # (v,)
+    stored: np.ndarray | None = None  # (n, 3) or (v, 3) uint8: own colors of the cloud, or of a surface alone
+    found: np.ndarray | None = None  # (n,) uint8: 1 stray, 2 its normal was turned, 3 on the rim of a hole, 0 nothing
 
 
-class View(NamedTuple):
+class ShapeView(NamedTuple):
     """Drawings of one shape, to be compared: same frame, same scale of errors."""
 
     shape: str
@@ -33,6 +35,8 @@ class View(NamedTuple):
     center: np.ndarray  # (3,) of the true shape
     radius: float
     limit: float  # error at the end of the colors, in the unit of the points
+    error: str = "errors"  # what it is called on the button
+    bar: str = ""  # beside the colors; "": the distance to the true surface, in thousandths of the radius
 
 
 class Packer:
@@ -51,13 +55,22 @@ class Packer:
         self.size += len(data)
         return place
 
-    def text(self) -> str:
-        """All arrays, compressed, as base64."""
-        return base64.b64encode(gzip.compress(b"".join(self.parts), 6, mtime=0)).decode()
+    def data(self) -> bytes:
+        """All arrays."""
+        return b"".join(self.parts)
 
 
-def encode(view: View) -> dict[str, Any]:
-    """The view as JSON; positions to 1/26000 of the radius, normals to half a degree, errors to 1/255 of the limit."""
+def encode(view: ShapeView) -> dict[str, Any]:
+    """The view as JSON, its arrays compressed, as base64 in `data`."""
+    head, data = view_arrays(view)
+    return head | {"data": base64.b64encode(gzip.compress(data, 6, mtime=0)).decode()}
+
+
+def view_arrays(view: ShapeView) -> tuple[dict[str, Any], bytes]:
+    """The view as JSON that tells where its arrays lie in the bytes.
+
+    Positions to 1/26000 of the radius, normals to half a degree, errors to 1/255 of the limit.
+    """
     packer = Packer()
     items = []
     for drawing in view.drawings:
@@ -65,30 +78,41 @@ def encode(view: View) -> dict[str, Any]:
         if drawing.cloud is not None:
             points = drawing.cloud[:, :3]
             normals = drawing.cloud[:, 3:6] if drawing.cloud.shape[1] >= 6 else None
-            item["cloud"] = vertices(packer, view, points, normals, drawing.cloud_error)
+            item["cloud"] = vertices(packer, view, points, normals, drawing.cloud_error, drawing.stored)
             item["cloud"]["spacing"] = round(spacing(points) / view.radius, 6)
+            if drawing.found is not None:
+                item["cloud"]["found"] = packer.add(drawing.found, "u1")
         if drawing.surface is not None:
             points, normals, faces = split_creases(drawing.surface)
-            error = drawing.surface_error
-            if error is not None:
-                copy_of = np.empty(len(points), np.int64)
-                copy_of[faces] = drawing.surface.faces
-                error = error[copy_of]
-            item["surface"] = vertices(packer, view, points, normals, error)
+            copy_of = np.empty(len(points), np.int64)
+            copy_of[faces] = drawing.surface.faces
+            error = None if drawing.surface_error is None else drawing.surface_error[copy_of]
+            alone = drawing.cloud is None and drawing.stored is not None
+            stored = np.asarray(drawing.stored)[copy_of] if alone else None
+            item["surface"] = vertices(packer, view, points, normals, error, stored)
             item["surface"]["index"] = packer.add(np.diff(faces.ravel(), prepend=0), "<i4")  # differences pack better
         items.append(item)
-    limit = f"{1e3 * view.limit / view.radius:.3g}"
-    return {"shape": view.shape, "kind": view.kind, "limit": limit, "items": items, "data": packer.text()}
+    limit = f"{view.limit:.3g}" if view.bar else f"{1e3 * view.limit / view.radius:.3g}"
+    bar = view.bar or "distance to the true surface, x 1e3 of its radius"
+    head = {"shape": view.shape, "kind": view.kind, "error": view.error, "bar": bar, "limit": limit}
+    return head | {"items": items}, packer.data()
 
 
 def vertices(
-    packer: Packer, view: View, points: np.ndarray, normals: np.ndarray | None, error: np.ndarray | None
+    packer: Packer,
+    view: ShapeView,
+    points: np.ndarray,
+    normals: np.ndarray | None,
+    error: np.ndarray | None,
+    stored: np.ndarray | None,
 ) -> dict[str, Any]:
-    """Points with their normals and errors, packed."""
+    """Points with their normals, errors and colors, packed."""
     unit = (points - view.center) / (RANGE * view.radius)
     places = {"position": packer.add(np.rint((unit.clip(-1, 1) + 1) * 32767.5), "<u2")}
     if normals is not None:
         places["normal"] = packer.add(np.rint(127 * normals.clip(-1, 1)), "i1")
     if error is not None:
         places["error"] = packer.add(np.rint(255 * (error / view.limit).clip(0, 1)), "u1")
+    if stored is not None:
+        places["stored"] = packer.add(stored, "u1")
     return places

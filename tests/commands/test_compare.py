@@ -19,8 +19,9 @@ from pnu.networks.pnu import PNU
 from pnu.report import comparison_page
 from pnu.report.comparison_tables import tables
 from pnu.report.shape_views import error_limit, points_for, rebuild, view
+from tests.chromium import CHROMIUM
 from tests.reconstruction.test_surfaces import icosphere
-from tests.report.test_page import CHROMIUM, browse
+from tests.report.test_page import browse
 
 SMALL = ["points=300", "truth_points=1200", "ratio=2", "size=100", "quiet=true"]
 NETWORK = {"_target_": "pnu.networks.pnu.PNU", "ratio": 2, "local_features": False}

@@ -29,7 +29,7 @@ from pnu.report.offline_page import write_page
 from pnu.report.plots import front, logarithmic, mean_curve, plots
 from pnu.report.sweep_report import differing, write_report
 from pnu.report.sweep_results import Setting, collect, effects
-from tests.report.test_page import CHROMIUM, needs_browser
+from tests.chromium import CHROMIUM, needs_browser
 from tests.training.test_train import patch_file  # noqa: F401  a fixture
 
 Make = Callable[..., Path]

@@ -1,0 +1,1 @@
+"""Pages that this machine shows itself in a browser."""
