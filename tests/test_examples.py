@@ -27,7 +27,7 @@ def test_examples_run(name: str) -> None:
 
 
 def test_what_users_call_has_an_example() -> None:
-    for name in ("upsample", "normals", "load"):
+    for name in ("upsample", "normals", "load", "PointCloudUpsampler"):
         assert ">>> " in (getattr(pnu, name).__doc__ or ""), name
     for node in ast.parse(MODULES["pnu.metrics.classes"].read_text()).body:
         if isinstance(node, ast.ClassDef) and node.name != "CloudMean":

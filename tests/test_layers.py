@@ -162,12 +162,17 @@ SECTIONS = ["Args", "Update", "Compute", "Returns", "Raises", "Source", "Example
 
 
 def documented(path: Path) -> Iterator[tuple[str, str | None]]:
-    """Public functions, classes and their methods but for hooks, with their docstrings."""
-    for node in ast.parse(path.read_text()).body:
+    """Public functions, classes and their methods but for hooks and overloads, with their docstrings."""
+    tree = ast.parse(path.read_text())
+    overloads = {n for n in ast.walk(tree) if "overload" in map(ast.unparse, getattr(n, "decorator_list", []))}
+    for node in tree.body:
+        if node in overloads:
+            continue
         if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
             yield node.name, ast.get_docstring(node)
             for method in node.body if isinstance(node, ast.ClassDef) else []:
-                named = isinstance(method, ast.FunctionDef) and not method.name.startswith(("_", "on_"))
+                own = isinstance(method, ast.FunctionDef) and method not in overloads
+                named = own and not method.name.startswith(("_", "on_"))
                 if named and not (method.name in HOOKS and ast.get_docstring(method) is None):
                     yield f"{node.name}.{method.name}", ast.get_docstring(method)
 
@@ -286,7 +291,7 @@ def test_import_is_light() -> None:
 
 
 def test_the_public_functions_are_listed_before_their_first_use() -> None:
-    assert {"load", "normals", "upsample"} <= loaded_by("import pnu; print(*dir(pnu))")
+    assert {"PointCloudUpsampler", "load", "normals", "upsample"} <= loaded_by("import pnu; print(*dir(pnu))")
 
 
 def test_only_pictures_and_reports_load_matplotlib(tmp_path: Path) -> None:

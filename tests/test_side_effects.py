@@ -56,6 +56,7 @@ points.flags.writeable = False  # a caller's array may be read-only
 FUNCTIONS = {
     "load": ["pnu.load('surface')", "pnu.load('pnu')"],
     "normals": ["pnu.normals(points)"],
+    "PointCloudUpsampler": ["pnu.PointCloudUpsampler(ratio=2).fit_transform(points, points)"],
     "upsample": [
         "pnu.upsample(points)",
         "pnu.upsample(points, points, model='pnu', ratio=2)",

@@ -8,7 +8,7 @@ from dataclasses import replace
 from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias, TypeVar, overload
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from pnu.geometry.cloud_normals import settled_normals
 from pnu.geometry.normal_estimation import complete_normals
 from pnu.geometry.unit_sphere import Frame, unit_sphere_frame
 from pnu.io import Cloud, check_cloud
+from pnu.io.library_clouds import Kind, LibraryCloud, kind_of, tensor_like
 from pnu.io.sensor import asked_sight
 from pnu.networks import checkpoints
 from pnu.reconstruction import fill_holes
@@ -35,17 +36,23 @@ from pnu.upsamplers.learned_normals import learned_normals
 from pnu.upsamplers.patches import with_unit_normals
 from pnu.upsamplers.surface_projection import is_clean_and_even
 
+Model: TypeAlias = "nn.Module | Upsampler | LoadedWeights | str | PathLike[str]"
+
 MINIMUM = 16  # points of a cloud
 LARGEST = 10**9  # points of an output
 
+# what comes back as the kind that was given, for type checkers and editors; arrays and lists come back as arrays
+CloudT = TypeVar("CloudT", bound=Tensor | LibraryCloud)
 
+
+@overload
 def upsample(
-    points: np.ndarray,
-    normals: np.ndarray | None = None,
+    points: CloudT,
+    normals: np.ndarray | Tensor | None = None,
     *,
     ratio: float = 4,
     spacing: float | None = None,
-    model: nn.Module | Upsampler | str | PathLike[str] = "surface",
+    model: Model = "surface",
     patch_size: int | None = None,
     density: Density = "auto",
     keep: bool | Literal["auto"] = "auto",
@@ -59,7 +66,54 @@ def upsample(
     seed: int = 0,
     progress: Progress = silent,
     parts: str | PathLike[str] | None = None,
-) -> np.ndarray:
+) -> CloudT: ...
+
+
+@overload
+def upsample(
+    points: np.ndarray | Sequence[Sequence[float]],
+    normals: np.ndarray | Tensor | None = None,
+    *,
+    ratio: float = 4,
+    spacing: float | None = None,
+    model: Model = "surface",
+    patch_size: int | None = None,
+    density: Density = "auto",
+    keep: bool | Literal["auto"] = "auto",
+    outliers: Treatment = "auto",
+    lines: Treatment = "auto",
+    signs: Treatment = "auto",
+    holes: float | None = None,
+    device: str = "auto",
+    devices: int = 1,
+    batch_size: int | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+    parts: str | PathLike[str] | None = None,
+) -> np.ndarray: ...
+
+
+def upsample(
+    points: Any,
+    normals: np.ndarray | Tensor | None = None,
+    *,
+    ratio: float = 4,
+    spacing: float | None = None,
+    model: Model = "surface",
+    patch_size: int | None = None,
+    density: Density = "auto",
+    keep: bool | Literal["auto"] = "auto",
+    outliers: Treatment = "auto",
+    lines: Treatment = "auto",
+    signs: Treatment = "auto",
+    holes: float | None = None,
+    device: str = "auto",
+    devices: int = 1,
+    batch_size: int | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+    parts: str | PathLike[str] | None = None,
+) -> Any:
     """A denser cloud on the same surface.
 
     Networks of patches are used as in the paper (`pnu.upsamplers.patches`); "surface" and upsamplers without a network
@@ -67,8 +121,10 @@ def upsample(
     as it was, modes and device too; generators and settings of torch are left alone.
 
     Args:
-        points: (n, 3), or (n, 6) with normals, n >= 16, in any unit and anywhere; an array, or a tensor on any device.
-            Points that are not finite, or at the place of another, are left out: n is the number of the others, and
+        points: (n, 3), or (n, 6) with normals, n >= 16, in any unit and anywhere: an array, a tensor on any device, or
+            a cloud of Open3D (`geometry.PointCloud`, `t.geometry.PointCloud`), trimesh (`PointCloud`), PyVista
+            (`PolyData`) or PyTorch Geometric (`Data`), whose normals, colors and other values are taken too. Points
+            that are not finite, or at the place of another, are left out: n is the number of the others, and
             `pnu.io.check_cloud` tells what it finds.
         normals: (n, 3), of any length; estimated and oriented where missing, zero or NaN here and in points.
         ratio: points out for each point in, any number >= 1.
@@ -99,7 +155,8 @@ def upsample(
 
     Returns:
         (round(ratio n), 6) float64: points in the frame and unit of the input, and unit normals; with `holes` those
-        that fill them after these.
+        that fill them after these. Of the kind that was given: a tensor on its device, float32 where it is, else
+        float64; a cloud of that library, with normals and its colors and other values carried over.
 
     Raises:
         ValueError: in one line, which argument is wrong and what was expected.
@@ -115,7 +172,9 @@ def upsample(
         >>> bool((abs(np.linalg.norm(dense[:, :3], axis=1) - 1) < 0.05).all())
         True
     """
-    given = _given(points, normals)
+    kind = kind_of(points)
+    expected = "points: expected an array (n, 3), or (n, 6) with normals"
+    given = check_cloud(Cloud(*_taken(points, normals, kind, expected, (3, 6))), "points", minimum=MINIMUM)
     count = output_count(len(given.points), ratio if spacing is None else ratio_of_spacing(given.points, spacing))
     sizes = (
         ("patch_size", patch_size, MINIMUM),
@@ -165,7 +224,9 @@ def upsample(
         progress("holes", 0, 1)
         found = np.vstack([found, fill_holes(found, holes)])
         progress("holes", 1, 1)
-    return found
+    if kind is not None:
+        return kind.dense(points, Cloud(found[:, :3], found[:, 3:], attributes(found, given)))
+    return tensor_like(points, found) if isinstance(points, Tensor) else found
 
 
 def _measured_first(found: np.ndarray, unit: Tensor, sparse: Tensor, given: Cloud) -> np.ndarray:
@@ -223,16 +284,42 @@ def output_count(n: int, ratio: float) -> int:
     return count
 
 
+@overload
 def normals(
-    points: np.ndarray,
-    normals: np.ndarray | None = None,
+    points: CloudT,
+    normals: np.ndarray | Tensor | None = None,
     *,
     viewpoint: np.ndarray | Sequence[float] | None = None,
     up: str | np.ndarray | Sequence[float] | None = None,
     side: Literal["out", "in"] | None = None,
     neighbors: int = 16,
     progress: Progress = silent,
-) -> np.ndarray:
+) -> CloudT: ...
+
+
+@overload
+def normals(
+    points: np.ndarray | Sequence[Sequence[float]],
+    normals: np.ndarray | Tensor | None = None,
+    *,
+    viewpoint: np.ndarray | Sequence[float] | None = None,
+    up: str | np.ndarray | Sequence[float] | None = None,
+    side: Literal["out", "in"] | None = None,
+    neighbors: int = 16,
+    progress: Progress = silent,
+) -> np.ndarray: ...
+
+
+def normals(
+    points: Any,
+    normals: np.ndarray | Tensor | None = None,
+    *,
+    viewpoint: np.ndarray | Sequence[float] | None = None,
+    up: str | np.ndarray | Sequence[float] | None = None,
+    side: Literal["out", "in"] | None = None,
+    neighbors: int = 16,
+    progress: Progress = silent,
+) -> Any:
     """Normals of a cloud: estimated where there are none, with signs that agree.
 
     Without anything that decides the side, they look outward on closed shapes, and to one side on open ones; given
@@ -240,7 +327,8 @@ def normals(
     it gets none. They depend neither on the order of the points nor on repeated ones.
 
     Args:
-        points: (n, 3), n >= 16, in any unit and anywhere; an array, or a tensor on any device.
+        points: (n, 3), n >= 16, in any unit and anywhere: an array, a tensor on any device, or a cloud of another
+            library as `upsample` takes it.
         normals: (n, 3), of any length; estimated where zero or NaN.
         viewpoint: place of the sensor, (3,), or of the sensor of each point, (n, 3), NaN where it is not known: normals
             look to where they were seen from.
@@ -250,7 +338,8 @@ def normals(
         progress: called as progress(stage, done, total).
 
     Returns:
-        (n, 3) float64, of unit length; NaN for points that are not finite.
+        (n, 3) float64, of unit length; NaN for points that are not finite. For a tensor a tensor, float32 where it is;
+        for a cloud of another library a copy of it with these normals.
 
     Raises:
         ValueError: in one line, which argument is wrong and what was expected.
@@ -266,10 +355,8 @@ def normals(
         >>> bool(((normals * sphere).sum(axis=1) > 0.9).all())
         True
     """
-    array = _array(points, "points: expected an array (n, 3)")
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise ValueError(f"points: expected an array (n, 3), found shape {array.shape}")
-    given = None if normals is None else _array(normals, f"normals: expected an array {array.shape}")
+    kind = kind_of(points)
+    array, given, _ = _taken(points, normals, kind, "points: expected an array (n, 3)", widths=(3,))
     asked = asked_sight(viewpoint, up, side)
     places = {}
     if asked is not None and asked.viewpoint is not None and asked.viewpoint.ndim == 2:
@@ -289,7 +376,9 @@ def normals(
     finite = np.isfinite(array).all(1)
     found = np.full(array.shape, np.nan)
     found[finite] = settled.normals[cKDTree(cloud.points).query(array[finite])[1]]  # each point is one of them
-    return found
+    if kind is not None:
+        return kind.with_normals(points, found)
+    return tensor_like(points, found) if isinstance(points, Tensor) else found
 
 
 def weights_source(
@@ -304,19 +393,24 @@ def weights_source(
     return checkpoints.resolve(model)
 
 
-def _given(points: np.ndarray, normals: np.ndarray | None) -> Cloud:
-    """The cloud that points (n, 3) or (n, 6) and normals (n, 3) describe, checked."""
-    expected = "points: expected an array (n, 3), or (n, 6) with normals"
+def _taken(
+    points: Any, normals: Any, kind: Kind | None, expected: str, widths: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray | None, dict[str, np.ndarray]]:
+    """Points (n, 3), normals and attributes as they are given: as arrays, or as an object of that kind."""
+    if kind is not None:
+        points, own, attributes = kind.read(points)[:3]
+    else:
+        own, attributes = None, {}
     array = _array(points, expected)
-    if array.ndim != 2 or array.shape[1] not in (3, 6):
+    if array.ndim != 2 or array.shape[1] not in widths:
         raise ValueError(f"{expected}, found shape {array.shape}")
     if array.shape[1] == 6:
-        if normals is not None:
-            raise ValueError("normals: are in points (n, 6) already; give points (n, 3), or no normals beside them")
-        array, normals = array[:, :3], array[:, 3:]
-    elif normals is not None:
-        normals = _array(normals, f"normals: expected an array {array.shape}")
-    return check_cloud(Cloud(array, normals, {}), "points", minimum=MINIMUM)
+        array, own = array[:, :3], array[:, 3:]
+    if own is not None and normals is not None:
+        there = "in points (n, 6) already" if kind is None else f"in the {kind.where[1]} already"
+        raise ValueError(f"normals: are {there}; give points without, or no normals beside them")
+    normals = own if normals is None else normals
+    return array, None if normals is None else _array(normals, f"normals: expected an array {array.shape}"), attributes
 
 
 def _array(values: Any, expected: str) -> np.ndarray:
@@ -353,13 +447,35 @@ def evaluating(model: object) -> Iterator[None]:
             module.training = True
 
 
+class LoadedWeights:
+    """The network of a run folder, of a file of weights or of shipped ones, read when first needed, and kept.
+
+    Args:
+        source: what `upsample` takes as `model`, as text or a path.
+
+    Raises:
+        ValueError: "newest", and no run has finished.
+    """
+
+    def __init__(self, source: str | PathLike[str]) -> None:
+        self.source = checkpoints.resolve(source)
+        self.read: dict[str, Any] = {}
+
+    def network(self, normals: np.ndarray | None = None, scanned: bool = False) -> Any:
+        """That for a cloud with these normals, see `weights_source`."""
+        meant = str(weights_source(self.source, normals, scanned))
+        if meant not in self.read:
+            self.read[meant] = classical(meant) if meant in CLASSICAL else checkpoints.load(meant)
+        return self.read[meant]
+
+
 def _model(model: Any, normals: np.ndarray | None, scanned: bool) -> tuple[Any, bool]:
     """The network or upsampler that is meant, and whether it is the caller's own."""
-    if not isinstance(model, str | PathLike):
-        return model, True
-    return (
-        classical(str(model)) if model in CLASSICAL else checkpoints.load(weights_source(model, normals, scanned))
-    ), False
+    if isinstance(model, str | PathLike):
+        model = LoadedWeights(model)
+    if isinstance(model, LoadedWeights):
+        return model.network(normals, scanned), False
+    return model, True
 
 
 def _on_device(model: Any, given: bool, device: str) -> tuple[Any, torch.device]:
