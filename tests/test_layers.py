@@ -294,6 +294,7 @@ def test_the_public_functions_are_listed_before_their_first_use() -> None:
     assert {"PointCloudUpsampler", "load", "normals", "upsample"} <= loaded_by("import pnu; print(*dir(pnu))")
 
 
+@pytest.mark.slow
 def test_only_pictures_and_reports_load_matplotlib(tmp_path: Path) -> None:
     (tmp_path / "cloud.xyz").write_text("\n".join(f"{x} {y} {x * y / 9}" for x in range(8) for y in range(8)))
     keys = [f"input={tmp_path}/cloud.xyz", f"output={tmp_path}/dense.ply", "quiet=true"]

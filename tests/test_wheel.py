@@ -108,6 +108,7 @@ def test_every_verb_answers_from_another_directory(site: Path, tmp_path: Path) -
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_an_installed_script_upsamples_with_the_shipped_weights(site: Path, tmp_path: Path) -> None:
     points = np.random.default_rng(0).normal(size=(200, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)

@@ -60,6 +60,7 @@ def test_every_card_says_what_it_was_trained_on() -> None:
     assert of_card("no such line") == Trained()
 
 
+@pytest.mark.slow
 def test_a_comparison_says_it_and_names_runs_without_their_time(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -95,6 +95,7 @@ def test_views_hold_every_method_and_the_truth(made: Path) -> None:
     assert not any("surface" in item for item in sparse["items"])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
 def test_page_is_drawn_in_a_browser(made: Path, tmp_path: Path) -> None:
     fragment = "form=surfaces&mode=errors&item=apss"
@@ -141,6 +142,7 @@ def test_a_network_of_a_run_folder(place: Path) -> None:
     assert rows["first"]["chamfer_sq"] == rows["ours"]["chamfer_sq"] > rows["floor"]["chamfer_sq"]
 
 
+@pytest.mark.slow
 def test_the_finished_runs_of_a_sweep(place: Path) -> None:
     (place / "sweep").mkdir()
     for name in ("wide_0123abcd", "no_cd_4567abcd", "broken_89ab"):

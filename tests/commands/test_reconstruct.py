@@ -167,6 +167,7 @@ def test_a_cloud_whose_every_point_is_repeated(tmp_path: Path, capsys: pytest.Ca
     assert "depth 5," in said  # 11, the deepest, where the spacing seemed zero
 
 
+@pytest.mark.slow
 def test_columns_of_text(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     points, normals = np.hsplit(sphere_points(300), 2)
     np.savetxt(tmp_path / "c.txt", np.hstack([normals, np.ones((300, 1)), points]))

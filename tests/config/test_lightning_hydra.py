@@ -143,6 +143,7 @@ def test_arguments_of_the_trainer_that_conf_does_not_show(train: Any) -> None:
     assert yaml.safe_load((run / "config.yaml").read_text())["trainer"]["gradient_clip_algorithm"] == "norm"
 
 
+@pytest.mark.slow
 def test_csv_and_several_loggers(train: Any) -> None:
     run = train(SEVERAL)
     with (run / "csv" / "metrics.csv").open() as file:
@@ -208,6 +209,7 @@ def test_a_run_with_an_average_goes_on_as_if_never_stopped(train: Any) -> None:
         assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
 
 
+@pytest.mark.slow
 def test_callbacks_are_put_together(train: Any, capsys: pytest.CaptureFixture[str]) -> None:
     run = train(STOPPING, OWN.strip("'"), WITHOUT)
     callbacks = yaml.safe_load((run / "config.yaml").read_text())["callbacks"]
@@ -217,6 +219,7 @@ def test_callbacks_are_put_together(train: Any, capsys: pytest.CaptureFixture[st
     assert "no checkpoint was kept" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_sanity_steps_count_for_nothing(train: Any) -> None:
     run = train(SANITY, *SUMMARY.split())
     plain = train(run="plain")

@@ -18,7 +18,9 @@ def test_there_are_many_of_both_kinds() -> None:
     assert shapes.names() == sorted(shapes.names("organic") + shapes.names("cad"))
 
 
-@pytest.mark.parametrize("name", shapes.names())
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if i % 3 else []) for i, name in enumerate(shapes.names())]
+)
 def test_closed_outward_unit(name: str) -> None:
     mesh = made(name)
     assert np.isfinite(mesh.vertices).all()

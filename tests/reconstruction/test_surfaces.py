@@ -61,8 +61,8 @@ def icosphere(levels: int = 4) -> Mesh:
     ("cloud", "volume", "tolerance"),
     [
         (sphere_points(5000), 4 / 3 * np.pi, 0.01),
-        (torus_points(5000), 2 * np.pi**2 * 0.4**2, 0.01),
-        (box_points(5000), 2.0 * 1.6 * 1.2, 0.02),
+        pytest.param(torus_points(5000), 2 * np.pi**2 * 0.4**2, 0.01, marks=pytest.mark.slow),
+        pytest.param(box_points(5000), 2.0 * 1.6 * 1.2, 0.02, marks=pytest.mark.slow),
     ],
     ids=["sphere", "torus", "box"],
 )
@@ -149,6 +149,7 @@ def test_child_may_fail_without_loss(
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_missing_open3d_has_its_own_exit_code(tmp_path: Path) -> None:
     (tmp_path / "open3d.py").write_text("raise ImportError('libGL.so.1: cannot open shared object file')")
     code = (

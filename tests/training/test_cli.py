@@ -162,6 +162,7 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path: Path, arguments: list
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_one_line_trains(tmp_path: Path, small: list[str]) -> None:
     done = train(tmp_path, *small, "loss.w3=0.05", "trainer.max_steps=20")
     assert (done.returncode, done.stderr) == (0, "")

@@ -282,6 +282,7 @@ def test_a_job_that_runs_is_left_alone(
 # --- failures ---
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("untraced")
 def test_a_failing_job_is_told_at_once_and_the_others_go_on(
     patch_file: Path,  # noqa: F811

@@ -387,6 +387,7 @@ def raw_scalars(path: Path, tag: str) -> list[Any]:
     return [event for event in EventFileLoader(str(path)).Load() if any(v.tag == tag for v in event.summary.value)]
 
 
+@pytest.mark.slow
 def test_a_finished_run_without_its_last_checkpoint_is_kept(train: Train, capsys: pytest.CaptureFixture[str]) -> None:
     run = train("trainer.max_steps=2", "trainer.val_check_interval=2")
     (run / "checkpoints/last.ckpt").unlink()
