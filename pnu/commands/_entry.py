@@ -111,6 +111,9 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
             from hydra._internal.utils import get_args_parser
 
             parsed = get_args_parser().parse_args(arguments)
+            modes = [mode for mode in ("run", "multirun", "cfg", "info", "shell_completion") if getattr(parsed, mode)]
+            if len(modes) > 1:
+                raise ValueError(f"--{modes[0]} and --{modes[1]}: one of them at a time")
             overrides = [o for o in parsed.overrides if not o.startswith("hydra.")]
             goes_on = parsed.multirun and "trainer" in fields(schema)
             with composer(name, parsed.config_dir) as compose:

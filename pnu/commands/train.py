@@ -20,7 +20,10 @@ class Train:
     name: str = doc("last part of the run folder's name")
     run: str | None = doc("run folder; null: outputs/<date>/<time>_<name>")
     resume: bool = doc("go on with the run in run=FOLDER, with its config, from its last checkpoint")
-    weights: str | None = doc("to start from: run folder, or weights that come with pnu; null: drawn by the seed")
+    weights: str | None = doc(
+        "to start from: run folder, or weights that come with pnu; previous: of the job before, in a sweep; null: "
+        "drawn by the seed"
+    )
     threads: int | None = doc("threads of a training on the CPU; null: one for each core; small patches want one")
     quiet: bool = doc("print the run folder alone")
     sweep: str | None = doc("name of a sweep (-m) below outputs/sweeps; null: made of the command line")
@@ -54,7 +57,7 @@ def train(cfg: Any) -> list[float] | None:
 
         from pnu import metrics, networks
         from pnu.networks import checkpoints
-        from pnu.training import callbacks, lightning_module
+        from pnu.training import callbacks, lightning_module, sweeps
 
         lightning_module.quieten()
         lightning_module.keep_threads()
@@ -69,6 +72,8 @@ def train(cfg: Any) -> list[float] | None:
         model, data = networks.build_network(config["model"], allow), parts.pop("data")
         lightning_module.check_input(model, data)
         if source := config.get("weights"):
+            if source == "previous":
+                record["weights"] = source = str(sweeps.weights_before(run))
             checkpoints.fill(model, checkpoints.load(source, allow).state_dict(), source)
         find = functools.partial(find_metric, allow=allow)
         chosen = metrics.with_own(config.get("metrics") or (), find)

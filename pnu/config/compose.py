@@ -193,8 +193,13 @@ def spell(overrides: list[str], schema: type, compose: Callable[..., Any]) -> li
     if not any("." in override.key_or_group for override in parsed):
         return overrides
     choices = choices_of(compose)
-    chosen = [raw for raw, override in zip(overrides, parsed, strict=True) if override.key_or_group in choices]
-    shown = flatten(OmegaConf.to_container(compose([first_value(raw) for raw in chosen])))
+    # Hydra composes a sweep without what it sweeps over at first
+    chosen = [
+        raw
+        for raw, override in zip(overrides, parsed, strict=True)
+        if override.key_or_group in choices and not override.is_sweep_override()
+    ]
+    shown = flatten(OmegaConf.to_container(compose(chosen)))
     spelled = []
     for raw, override in zip(overrides, parsed, strict=True):
         key = override.key_or_group
@@ -202,11 +207,6 @@ def spell(overrides: list[str], schema: type, compose: Callable[..., Any]) -> li
         mine = key not in choices and key.partition(".")[0] in groups(schema) and not override.is_delete()
         spelled.append(f"++{plain}" if mine and (key not in shown or plain != raw) else raw)
     return spelled
-
-
-def first_value(raw: str) -> str:
-    """An override with the first of its values, where it sweeps over several."""
-    return next(variations([raw]))[0]
 
 
 def choices_of(compose: Callable[..., Any]) -> list[str]:

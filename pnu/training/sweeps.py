@@ -98,6 +98,23 @@ def job_folder(config: Mapping[str, Any]) -> RunFolder:
     return folder
 
 
+def weights_before(run: RunFolder) -> Path:
+    """The run folder of the job before this one in its sweep, whose best weights it starts from.
+
+    Raises:
+        ValueError: there is none, or it has not finished.
+    """
+    number = run.facts.get("job")
+    if number is None:
+        raise ValueError("weights=previous: the job before is meant, in a sweep (-m) alone; give a run folder")
+    before = [other for other in runs(run.path.parent) if other.read_record().get("job") == number - 1]
+    if not before or before[0].read_record().get("status") != "finished":
+        raise ValueError(
+            f"weights=previous: job {number - 1}, which is before this one, has not finished; run one after the other"
+        )
+    return before[0].path
+
+
 def label_of(overrides: str) -> str:
     """A short name of what sets a job apart: "seed=0,setting=loss_terms/no_cd" becomes "no_cd_seed-0"; no sign in it
     wants quotes."""

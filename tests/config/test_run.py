@@ -17,10 +17,12 @@ import pnu
 from pnu.commands._entry import command, renamed
 from pnu.commands.compare import Compare
 from pnu.commands.train import Train
-from pnu.config.compose import compose_config, composer, config_folder, flatten, variations
+from pnu.commands.train import main as train
+from pnu.config.compose import compose_config, composer, config_folder, flatten, spell, variations
 from pnu.config.instantiate import instantiate
 from pnu.config.schema import checked_config, doc, fields, groups, known_keys, nearest_key, unsaid_keys
 from pnu.training.run_folder import RunFolder, config_hash, new_path
+from tests.refusals import refused
 
 COMMANDS = sorted(path.stem for path in config_folder().glob("*.yaml") if path.stem != "command")
 GROUPS = sorted(path.name for path in config_folder().iterdir() if path.is_dir())
@@ -116,6 +118,17 @@ def test_mistakes_get_one_line(override: str, message: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         compose_config(Train, [override])
     assert "\n" not in str(caught.value)
+
+
+def test_two_ways_to_run_at_once_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert refused(capsys, train, ["-m", "--cfg", "job"]) == "error: --multirun and --cfg: one of them at a time"
+
+
+def test_a_key_that_a_swept_overlay_shows_is_added_where_it_is_not() -> None:
+    """Hydra composes the config without `scale` first, where data=patches shows no batch_size."""
+    with composer("train") as compose:
+        line = ["data=patches", "scale=small,full", "data.batch_size=4"]
+        assert spell(line, Train, compose) == [*line[:2], "++data.batch_size=4"]
 
 
 @pytest.mark.parametrize(("choice", "extra"), [("joblib", "sweeps"), ("ray", "ray")])

@@ -210,6 +210,32 @@ def test_a_sweep_started_again_skips_what_has_finished(
 
 
 @pytest.mark.slow
+def test_a_curriculum_goes_on_from_the_job_before(
+    patch_file: Path,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    line = [*("-m", "experiment=paper_cpu", "sweep=paper", "data=patches", f"data.path={patch_file}", "quiet=true")]
+    line += ["data.batch_size=4", "trainer.max_steps=2", "trainer.val_check_interval=1", "callbacks.pictures.clouds=0"]
+    main([*line, "scale=curriculum_64,curriculum_256", "data.target_points=256"])
+    folder = tmp_path / "outputs" / "sweeps" / "paper"
+    first, second = sorted(records(folder).items(), key=lambda item: item[1]["job"])
+    assert first[1]["status"] == second[1]["status"] == "finished"
+    assert "weights" not in first[1]
+    assert Path(second[1]["weights"]).name == first[0]
+    assert yaml.safe_load((folder / second[0] / "config.yaml").read_text())["data"]["input_points"] == 256
+    found = metrics(folder)
+    assert "untrained" in found[first[0]]
+    assert "start" in found[second[0]]
+    capsys.readouterr()
+    with pytest.raises(SystemExit):
+        main([*line, "scale=curriculum_256", "sweep=alone"])
+    assert "weights=previous: job -1, which is before this one, has not finished" in capsys.readouterr().err
+
+
+@pytest.mark.slow
 def test_killed_in_the_middle_and_started_again(
     patch_file: Path,  # noqa: F811
     tmp_path: Path,
