@@ -136,13 +136,19 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
                 arguments = [respelled.get(argument, argument) for argument in arguments]
                 check_keys(next(variations(overrides)), schema, compose)  # before the config itself adds to the sweep
                 swept = sweeps.parameters(overrides, compose) if parsed.multirun else []
-                for one in variations([*swept, *overrides]):
+                jobs_wanted, several = False, list(variations([*swept, *overrides]))
+                for one in several:
                     check_keys(one, schema, compose)
                     if parsed.cfg:
                         continue
                     config = checked(one, schema, compose)
                     if goes_on:
                         sweeps.check_job(config)
+                    if parsed.multirun and in_jobs(config, schema):
+                        jobs_wanted = True
+                        if len(several) > 1:
+                            asked = "=".join(schema.jobs[:2])  # type: ignore[attr-defined]
+                            raise ValueError(f"{asked}: makes the jobs of one run; give each key one value")
                 if parsed.cfg == "job" and not parsed.multirun:
                     added = folder_arguments(compose([*overrides, *hydras_own(parsed.overrides)], True), schema)
                     overrides += [o for o in added if not o.startswith("hydra.")]
@@ -161,7 +167,9 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
         start = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=name)(task)
         with replaced_argv(arguments), quoting.typed(name, given):
             try:
-                if not goes_on or parsed.cfg:
+                if jobs_wanted:
+                    run_in_jobs(start, function, config, schema, arguments)
+                elif not goes_on or parsed.cfg:
                     start()
                 else:
                     sweeps.run(start, Path(hydra_config.sweep.dir))
@@ -174,6 +182,39 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
     main.schema = schema  # type: ignore[attr-defined]
     main.__doc__ = schema.__doc__
     return main
+
+
+def in_jobs(config: Any, schema: type) -> bool:
+    """Whether a command is to be done in jobs: `jobs` of its schema names the key and value that ask for it."""
+    key, value, _ = getattr(schema, "jobs", ("", None, None))
+    return bool(key) and config[key] == value
+
+
+def run_in_jobs(
+    start: Callable[[], None], finish: Callable[[Any], Any], config: Any, schema: type, arguments: Sequence[str]
+) -> None:
+    """A command as multiruns, one after the other, of the overrides that `jobs` of its schema gives; then as a whole.
+
+    A job that ends early does not end it: what it leaves is done in the end, which raises its error if there is one.
+    """
+    from pnu.training.run_folder import INTERRUPTED
+
+    key, _, rounds = schema.jobs  # type: ignore[attr-defined]
+    kept = [argument for argument in arguments if not argument.startswith(f"{key}=")]
+    try:
+        for overrides in rounds(config):
+            with replaced_argv(sorted([*overrides, *kept], key=is_override)):  # options first
+                try:
+                    start()
+                except SystemExit as ended:
+                    if ended.code == INTERRUPTED:
+                        raise
+                    warn("a job ended early; what it has left is done here")
+        finish(config)
+    except (ValueError, OSError) as error:
+        if full_errors():
+            raise
+        stop(error)
 
 
 def hydras_own(overrides: Sequence[str]) -> list[str]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from pnu.commands import _filled, _sides
+from pnu.commands import _filled, _sides, _tiles
 from pnu.commands._entry import command
 from pnu.config.quoting import shell_line
 from pnu.config.schema import doc
@@ -25,6 +25,7 @@ class Upsample:
 
     also: ClassVar = {"model": "run"}
     commas: ClassVar = ("columns", "viewpoint")
+    jobs: ClassVar = ("tiles", "all", _tiles.jobs)
     input: str = doc(
         "file to read: ply, text (xyz, csv, pts ...), pcd, las, laz, e57, npy, npz; of a mesh its vertices"
     )
@@ -54,6 +55,8 @@ class Upsample:
     lines: str = doc("auto: scan lines, dense along and sparse across, are thinned out first; keep: they stay")
     holes: float | None = doc(_filled.HOLES)
     removed: str | None = doc("file for the points that were taken out; null: none is written")
+    memory: str | None = doc(_tiles.MEMORY)
+    tiles: str | None = doc(_tiles.TILES)
     patch_size: int | None = doc("points of a patch, at least 16; null: what the network was made for")
     batch_size: int | None = doc("patches (surface: points) at once, bounds the memory; null: by the device")
     device: str = doc("auto, cpu, cuda, cuda:1 ...")
@@ -79,6 +82,9 @@ def upsample(cfg: Any) -> None:
     for name, path in (("output", cfg.output), ("removed", cfg.removed)):
         if path is not None and Path(path).resolve() == Path(cfg.input).resolve():
             raise ValueError(f"{name}={path}: is the input; give another name")
+    if _tiles.in_tiles(cfg):
+        _tiles.upsample_in_tiles(cfg, say)
+        return
     if cfg.sample is None:
         cloud = io.read_cloud(cfg.input, normals=cfg.normals != "estimate", columns=cfg.columns)
     else:

@@ -79,7 +79,7 @@ def farthest_in_blocks(
 
         def first(members: Index) -> Decline:
             number = min(int(1.1 * wanted * len(members) / n) + 16, len(members))
-            return _decline(xyz[members[choose(xyz[members], number)]], len(members))
+            return decline_of(xyz[members[choose(xyz[members], number)]], len(members))
 
         declines = []
         for decline in pool.map(first, blocks.members):
@@ -135,7 +135,7 @@ def _choose_all(
         m = min(len(fixed) + int(1.02 * share * len(free)) + 16, len(both))
         while True:
             order = choose(xyz[both], m)
-            decline = _decline(xyz[both[order]], len(both))
+            decline = decline_of(xyz[both[order]], len(both))
             if m == len(both) or decline.distance[-1] < reach:
                 break
             m = min(max(int(1.05 * decline.before(reach)), m + m // 20 + 16), len(both))
@@ -182,7 +182,7 @@ def _choose_all(
     return np.concatenate(chosen), np.concatenate(distance)
 
 
-def _decline(points: NDArray[np.float32], most: int) -> Decline:
+def decline_of(points: NDArray[np.float32], most: int) -> Decline:
     """From points in the order of choice."""
     m = len(points)
     probes = np.unique(np.linspace(m // 8, m - 1, PROBES).astype(np.int64))

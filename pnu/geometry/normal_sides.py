@@ -75,12 +75,20 @@ def seen_signs(
     with np.errstate(invalid="ignore"):
         way = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-300)
     seen = np.nan_to_num((lines * way).sum(1))
+    if viewpoint is not None and np.ndim(viewpoint) == 1:
+        seen[_hidden(points, lines, np.asarray(viewpoint, np.float64))] = 0
+    return voted_signs(points, lines, seen, surely=viewpoint is None)
+
+
+def voted_signs(points: np.ndarray, lines: np.ndarray, seen: np.ndarray, *, surely: bool = False) -> np.ndarray:
+    """+1 or -1 for each unit line (n, 3) at points (n, 3), as votes (n,) of -1 to 1 and the neighbors have it, (n,).
+
+    surely: clear votes decide, whatever the neighbors say. Lines of a part without votes keep most of their sides.
+    """
     pairs = Couplings.of(points, lines)
     graph = _graph(pairs, len(points), 1.01 - np.abs(pairs.coupling) + pairs.rise)
     part = connected_components(graph, directed=False)[1]
-    if viewpoint is not None and np.ndim(viewpoint) == 1:
-        seen[_hidden(points, lines, np.asarray(viewpoint, np.float64))] = 0
-    sure = (np.abs(seen) > CLEAR) & (viewpoint is None)
+    sure = (np.abs(seen) > CLEAR) & surely
     as_given = np.where(np.bincount(part, seen)[part] < 0, -1.0, 1.0)
     followed = _followed(points, lines, seen, graph, part)
     voice = np.where(sure, SURELY * seen, seen)

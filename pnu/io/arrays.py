@@ -2,7 +2,7 @@
 
 import io
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,20 @@ POINT_ARRAYS = ("points", "xyz", "point", "pos", "position", "positions", "coord
 NORMAL_ARRAYS = ("normals", "normal")
 COLOR_ARRAYS = ("colors", "color", "colors", "rgb")
 LARGEST = 1000  # bytes that a byte of an archive may hold: deflate makes no more
+
+
+def npy_slices(path: Path, rows: int) -> Iterator[np.ndarray | dict[str, np.ndarray]]:
+    """Rows (k, c) of an npy, or columns by name of a structured one, so many rows at a time."""
+    try:
+        values = np.load(path, mmap_mode="r", allow_pickle=False)
+    except Exception as error:
+        raise _damaged(path, "npy", error) from None
+    if not isinstance(values, np.ndarray):
+        raise ValueError(f"{path}: is an archive of arrays; name it .npz")
+    flat = values.reshape(-1) if values.dtype.names else values.reshape(-1, *values.shape[-1:])
+    for start in range(0, len(flat), rows):
+        part = np.load(path, mmap_mode="r", allow_pickle=False).reshape(flat.shape)[start : start + rows]
+        yield _table(path, part)[0]
 
 
 def read_array(path: Path) -> tuple[np.ndarray | dict[str, np.ndarray], tuple[str, ...]]:

@@ -55,8 +55,11 @@ class Fields(NamedTuple):
     notes: tuple[str, ...]  # what was left out
 
 
-def arranged(columns: Mapping[str, np.ndarray]) -> Fields:
-    """Points, normals and colors found among columns (n,) by name, without regard to case."""
+def arranged(columns: Mapping[str, np.ndarray], *, colors_as_found: bool = False) -> Fields:
+    """Points, normals and colors found among columns (n,) by name, without regard to case.
+
+    colors_as_found: in the numbers of the columns, for who knows only a part of them.
+    """
     left = dict(columns)
     notes = []
 
@@ -73,7 +76,7 @@ def arranged(columns: Mapping[str, np.ndarray]) -> Fields:
     normals = take(NORMALS)
     colors = take(COLORS)
     if colors is not None and (alpha := take(tuple((name,) for name in ALPHAS))) is not None:
-        if alpha.dtype != colors.dtype:
+        if alpha.dtype != colors.dtype and not colors_as_found:
             colors, alpha = as_colors(colors), as_colors(alpha)
         colors = np.hstack([colors, alpha])
     for kind, given, spellings in (("normals", normals, NORMALS), ("colors", colors, COLORS)):
@@ -82,7 +85,8 @@ def arranged(columns: Mapping[str, np.ndarray]) -> Fields:
                 notes.append(f"{' '.join(found)} left out: a second set of {kind}")
                 for name in found:
                     del left[name]
-    return Fields(points, normals, None if colors is None else as_colors(colors), left, tuple(notes))
+    found_colors = colors if colors is None or colors_as_found else as_colors(colors)
+    return Fields(points, normals, found_colors, left, tuple(notes))
 
 
 def distinct_names(names: Collection[str], own: Collection[str], *, length: int = 1000) -> dict[str, str]:
@@ -113,11 +117,11 @@ def matching(names: tuple[str, ...], columns: Mapping[str, np.ndarray]) -> list[
     return [name for name in found if name is not None] if None not in found else []
 
 
-def as_colors(values: np.ndarray) -> np.ndarray:
-    """uint8 of colors in 0..1 (floats), 0..255, or 16 bits (0..65535)."""
+def as_colors(values: np.ndarray, most: float | None = None) -> np.ndarray:
+    """uint8 of colors in 0..1 (floats), 0..255, or 16 bits (0..65535); `most`: of all, where these are a part."""
     if values.dtype == np.uint8:
         return values
-    most = np.nanmax(values, initial=0)
+    most = np.nanmax(values, initial=0) if most is None else most
     if most > 255:
         scale = 1 / 257
     else:

@@ -5,7 +5,8 @@ import struct
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -58,10 +59,49 @@ def read_las(path: Path, pulses: bool = False) -> Content:
             standard = (*CARRIED, *PULSES) if pulses else CARRIED
             return (*_content(file.header, _slices(laspy, path, file), standard), notes)
     except Exception as error:  # laspy and its decompressors know many kinds
-        if isinstance(error, ValueError) and str(error).startswith(f"{path}: is compressed"):
-            raise
-        reason = (str(error).splitlines() or [""])[0][:80]
-        raise ValueError(f"{path}: is no las file that can be read ({reason}); export it again") from None
+        raise _damaged_las(path, error) from None
+
+
+def las_slices(path: Path, rows: int) -> Iterator[tuple[np.ndarray, np.ndarray | None, dict[str, np.ndarray]]]:
+    """Points, normals and attributes of `rows` points at a time, in the order of the file.
+
+    Attributes that are zero all over the file are among them, and colors have 16 bits, as they are found.
+    """
+    laspy = _laspy(path)
+    try:
+        _check_counts(path)
+        with laspy.open(path) as file:
+            done, promised = 0, file.header.point_count
+            known = set(file.header.point_format.dimension_names)
+            names = [*CARRIED, *file.header.point_format.extra_dimension_names]
+            names = [name for name in names if name in known and name not in NORMAL and FOREIGN + name not in known]
+            for chunk in _slices(laspy, path, file, rows):
+                points = np.stack([chunk.x, chunk.y, chunk.z], 1)
+                normals = np.stack([chunk[name] for name in NORMAL], 1) if known.issuperset(NORMAL) else None
+                attributes = {name.removeprefix(FOREIGN): np.asarray(chunk[name]) for name in names}
+                if known.issuperset(COLORS):
+                    attributes["colors"] = np.stack([chunk[name] for name in COLORS], 1)
+                yield points, normals, attributes
+                done += len(points)
+            if done < promised:
+                raise ValueError(f"the header promises {promised} points, the file holds {done}")
+    except GeneratorExit:
+        raise
+    except Exception as error:
+        raise _damaged_las(path, error) from None
+
+
+def las_is_geographic(path: Path) -> bool:
+    """Whether the coordinate system of a file has degrees for x and y."""
+    with _laspy(path).open(path) as file:
+        return _geographic(file.header)
+
+
+def _damaged_las(path: Path, error: Exception) -> Exception:
+    if isinstance(error, ValueError) and str(error).startswith(f"{path}: is compressed"):
+        return error
+    reason = (str(error).splitlines() or [""])[0][:80]
+    return ValueError(f"{path}: is no las file that can be read ({reason}); export it again")
 
 
 def is_from_the_air(path: Path) -> bool:
@@ -93,11 +133,11 @@ def _check_counts(path: Path) -> None:
         raise ValueError("its header counts more records than it has room for")
 
 
-def _slices(laspy: ModuleType, path: Path, file: Any) -> Iterator[Any]:
+def _slices(laspy: ModuleType, path: Path, file: Any, most: int = SLICE) -> Iterator[Any]:
     """The points of an open file; compressed ones from a child process, which may crash without loss."""
     header = file.header
     kind = header.point_format.dtype()
-    rows = max(1, min(SLICE, SLICE_BYTES // kind.itemsize))
+    rows = max(1, min(most, SLICE_BYTES // kind.itemsize))
     if not header.are_points_compressed:
         yield from file.chunk_iterator(rows)
         return
@@ -188,45 +228,64 @@ def write_las(
 
     Returns under which name each attribute was written.
     """
+    with las_writer(path, points.min(0), points.max(0), normals is not None, attributes) as (names, write):
+        for start in range(0, len(points), SLICE):
+            part = slice(start, start + SLICE)
+            some = {name: values[part] for name, values in attributes.items()}
+            write(points[part], None if normals is None else normals[part], some)
+    return names
+
+
+@contextmanager
+def las_writer(
+    path: Path, low: np.ndarray, high: np.ndarray, normals: bool, attributes: Mapping[str, np.ndarray]
+) -> Iterator[tuple[dict[str, str], Callable[[np.ndarray, np.ndarray | None, Mapping[str, np.ndarray]], None]]]:
+    """A file that takes points a part at a time: write(points, normals, attributes); and the names of attributes.
+
+    low, high: corners of the box of all points. attributes: all of them, or a part that says what they are like: values
+    that their dimension of las cannot hold go into one of its own.
+    """
     laspy = _laspy(path)
     names = distinct_names([name for name in attributes if name != "colors"], (*XYZ, *NORMAL, *COLORS), length=LONGEST)
     header = laspy.LasHeader(version="1.4", point_format=7 if "colors" in attributes else 6)
-    header.offsets = np.floor(points.min(0))
-    extent = max(float((points.max(0) - header.offsets).max()), 1e-9)
+    header.offsets = np.floor(low)
+    extent = max(float((high - header.offsets).max()), 1e-9)
     header.scales = np.full(3, 10 ** np.ceil(np.log10(extent / 2**31 * 1.001)))
     known = {dimension.name: dimension for dimension in header.point_format.dimensions}
-    if "scan_angle_rank" in names and "scan_angle" not in names:
+    ranked = "scan_angle_rank" in names and "scan_angle" not in names
+    if ranked:
         names["scan_angle_rank"] = "scan_angle"
-        attributes = {
-            **attributes,
-            "scan_angle_rank": np.rint(attributes["scan_angle_rank"] / RANK).clip(-30000, 30000),
-        }
-    columns = {}
+
+    def turned(given: str, values: np.ndarray) -> np.ndarray:
+        return np.rint(values / RANK).clip(-30000, 30000) if ranked and given == "scan_angle_rank" else values
+
+    columns, extra = {}, []
     for given, values in attributes.items():
         if given != "colors":
-            name = names[given]
-            columns[name if name not in known or _fits(known[name], values) else FOREIGN + name] = values
-    if normals is not None:
-        columns |= dict(zip(NORMAL, normals.astype(np.float32).T, strict=True))
-    header.add_extra_dims(
-        [
-            laspy.ExtraBytesParams(name=name, type=f"{values.shape[1] if values.ndim > 1 else ''}{values.dtype}")
-            for name, values in columns.items()
-            if name not in known
-        ]
-    )
+            name, values = names[given], turned(given, np.asarray(values))
+            column = name if name not in known or _fits(known[name], values) else FOREIGN + name
+            columns[given] = column
+            if column not in known:
+                width = f"{values.shape[1] if values.ndim > 1 else ''}{values.dtype}"
+                extra.append(laspy.ExtraBytesParams(name=column, type=width))
+    extra += [laspy.ExtraBytesParams(name=name, type="float32") for name in NORMAL if normals]
+    header.add_extra_dims(extra)
     try:
         with laspy.open(path, mode="w", header=header, do_compress=path.suffix.lower() == ".laz") as file:
-            for start in range(0, len(points), SLICE):
-                part = slice(start, start + SLICE)
-                record = laspy.ScaleAwarePointRecord.zeros(len(points[part]), header=header)
-                record.x, record.y, record.z = points[part].T
-                for name, values in columns.items():
-                    record[name] = values[part]
-                if "colors" in attributes:
-                    for name, values in zip(COLORS, attributes["colors"][part].T, strict=False):
-                        record[name] = values.astype(np.uint16) * 257
+
+            def write(points: np.ndarray, directions: np.ndarray | None, values: Mapping[str, np.ndarray]) -> None:
+                record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
+                record.x, record.y, record.z = points.T
+                for given, column in columns.items():
+                    record[column] = turned(given, np.asarray(values[given]))
+                if directions is not None:
+                    for name, part in zip(NORMAL, directions.astype(np.float32).T, strict=True):
+                        record[name] = part
+                if "colors" in values:
+                    for name, part in zip(COLORS, values["colors"].T, strict=False):
+                        record[name] = part.astype(np.uint16) * 257
                 file.write_points(record)
+
+            yield names, write
     except RuntimeError as error:  # of the compressor, where the disk is full
         raise OSError(str(error)) from error
-    return names

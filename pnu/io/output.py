@@ -63,10 +63,7 @@ def kept_attributes(path: str | Path, names: Iterable[str]) -> list[str]:
 
 
 def _write_las(path: Path, cloud: Cloud) -> list[str]:
-    attributes = {name: _storable(values) for name, values in cloud.attributes.items()}
-    if "colors" in attributes:
-        attributes["colors"] = as_colors(attributes["colors"])
-    return _renamed(write_las(path, cloud.points, cloud.normals, attributes))
+    return _renamed(write_las(path, cloud.points, cloud.normals, storable_attributes(cloud.attributes)))
 
 
 def _write_text(path: Path, cloud: Cloud) -> list[str]:
@@ -93,18 +90,43 @@ def _renamed(names: Mapping[str, str]) -> list[str]:
     return [f"'{name}' is written as '{found}'" for name, found in names.items() if found != "_".join(name.split())]
 
 
-def _write_ply(path: Path, cloud: Cloud) -> list[str]:
-    own = xyz_columns(cloud.points) | ply_normals(cloud.normals)
+def ply_columns(
+    points: np.ndarray,
+    normals: np.ndarray | None,
+    attributes: Mapping[str, np.ndarray],
+    *,
+    single: bool | None = None,
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Properties of a ply's vertices (n,), and under which name each attribute is among them.
+
+    single: whether coordinates are float32; None: where that is enough.
+    """
+    if single is None:
+        own = xyz_columns(points)
+    else:
+        own = dict(zip(XYZ, points.astype(np.float32 if single else np.float64).T, strict=True))
+    own |= ply_normals(normals)
     more: dict[str, np.ndarray] = {}
-    for name, values in cloud.attributes.items():
+    for name, values in attributes.items():
         if name == "colors":
             own |= dict(zip((*COLOR, "alpha"), as_colors(values).T, strict=False))
         elif values.ndim == 1:
             more[name] = _storable(values)
         else:
-            more |= {f"{name}_{i}": _storable(column) for i, column in enumerate(values.reshape(len(values), -1).T)}
+            flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
+            more |= {f"{name}_{i}": _storable(column) for i, column in enumerate(flat.T)}
     names = distinct_names(more, own)
-    write_ply(path, own | {names[name]: values for name, values in more.items()})
+    return own | {names[name]: values for name, values in more.items()}, names
+
+
+def storable_attributes(attributes: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Attributes in types that ply and las know; colors as uint8."""
+    return {name: as_colors(v) if name == "colors" else _storable(v) for name, v in attributes.items()}
+
+
+def _write_ply(path: Path, cloud: Cloud) -> list[str]:
+    columns, names = ply_columns(cloud.points, cloud.normals, cloud.attributes)
+    write_ply(path, columns)
     return _renamed(names)
 
 

@@ -2,7 +2,7 @@
 
 import mmap
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -306,20 +306,60 @@ def _ragged(path: Path, data: mmap.mmap, start: int, element: Element, order: st
 
 def write_ply(path: Path, vertex: Mapping[str, np.ndarray], faces: np.ndarray | None = None) -> None:
     """Binary little-endian ply of vertex properties (n,) and, if given, triangles (f, 3)."""
-    dtype = np.dtype([(name, values.dtype.newbyteorder("<")) for name, values in vertex.items()])
     n = len(next(iter(vertex.values())))
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
-    header += [f"property {NAMES[values.dtype.str[1:]]} {name}" for name, values in vertex.items()]
-    if faces is not None:
-        header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
     with path.open("wb") as handle:
-        handle.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii", "replace"))
+        handle.write(_header_text(n, vertex, 0 if faces is None else len(faces), faces is not None))
         for start in range(0, n, SLICE):
-            rows = np.empty(min(SLICE, n - start), dtype)
-            for name, values in vertex.items():
-                rows[name] = values[start : start + SLICE]
-            rows.tofile(handle)
+            vertex_rows({name: values[start : start + SLICE] for name, values in vertex.items()}).tofile(handle)
         if faces is not None:
             triangles = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", (3,))])
             triangles["count"], triangles["corners"] = 3, faces
             triangles.tofile(handle)
+
+
+def _header_text(n: int, vertex: Mapping[str, np.ndarray], faces: int, with_faces: bool) -> bytes:
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
+    header += [f"property {NAMES[values.dtype.str[1:]]} {name}" for name, values in vertex.items()]
+    if with_faces:
+        header += [f"element face {faces}", "property list uchar int vertex_indices"]
+    return ("\n".join([*header, "end_header"]) + "\n").encode("ascii", "replace")
+
+
+def vertex_header(n: int, vertex: Mapping[str, np.ndarray]) -> bytes:
+    """The header of a ply of n vertices with such properties, whose rows follow (`vertex_rows`)."""
+    return _header_text(n, vertex, 0, False)
+
+
+def vertex_rows(vertex: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Vertex properties (n,) as rows of a binary file, (n,) structured."""
+    rows = np.empty(len(next(iter(vertex.values()))), [(name, v.dtype.newbyteorder("<")) for name, v in vertex.items()])
+    for name, values in vertex.items():
+        rows[name] = values
+    return rows
+
+
+def ply_slices(path: Path, rows: int) -> Iterator[dict[str, np.ndarray]]:
+    """Columns of the vertices of a binary file, `rows` at a time, in their order; lists of a vertex are left out.
+
+    `ValueError` for text, lists of several lengths, and what `read_ply` refuses.
+    """
+    data = _mapped(path)
+    order, elements, start = _header(path, data)
+    if order is None:
+        raise ValueError(f"{path}: is a ply in text, which is not read in slices; save it in binary")
+    for element in elements:
+        if element.name != "vertex":
+            start = _skip(path, data, start, element, order)
+            continue
+        if not _fits(path, data, start, element):
+            return
+        dtype = _row_dtype(element, order, _row_lengths(data, start, element, order)[0])
+        if any(item.length for item in element.properties):
+            raise ValueError(f"{path}: its vertices hold lists, which are not read in slices; save it without")
+        if element.size * dtype.itemsize > len(data) - start:
+            raise _short(path, element, f"{(len(data) - start) // dtype.itemsize}")
+        for first in range(0, element.size, rows):
+            # read, not mapped: what has been looked at of a mapped file counts as memory
+            part = np.fromfile(path, dtype, min(rows, element.size - first), offset=start + first * dtype.itemsize)
+            yield {item.name: part[item.name].astype(item.type) for item in element.properties}
+        return

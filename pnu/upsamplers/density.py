@@ -40,8 +40,14 @@ def point_counts(points: NDArray[np.float64], count: int, density: Density) -> N
     even = count * areas / areas.sum()
     if count < n or (even < THINNED).mean() < SOME:
         return None
-    counts: NDArray[np.float64] = even
-    floor = np.sqrt(count / n)
+    counts: NDArray[np.float64] = even_above_floor(areas, count)
+    return counts
+
+
+def even_above_floor(areas: NDArray[np.float64], count: float) -> NDArray[np.float64]:
+    """Points for each of the areas (n,), `count` in all: sqrt(count / n) at least, else in proportion to the area."""
+    counts = count * areas / areas.sum()
+    floor = np.sqrt(count / len(areas))
     for _ in range(60):  # as water fills what lies below its level
         low = counts <= floor
         level = (count - floor * low.sum()) / max(areas[~low].sum(), 1e-300)
@@ -49,19 +55,20 @@ def point_counts(points: NDArray[np.float64], count: int, density: Density) -> N
         if (filled == counts).all():
             break
         counts = filled
-    counts *= count / counts.sum()
-    return counts
+    found: NDArray[np.float64] = counts * (count / counts.sum())
+    return found
 
 
 def groups_of_like_spacing(
-    points: NDArray[np.float64], counts: NDArray[np.float64], count: int, least: int = 32
+    points: NDArray[np.float64], counts: NDArray[np.float64], count: int, least: int = 32, widest: float | None = None
 ) -> list[tuple[NDArray[np.int64], int]]:
     """Rows of points (n, 3) whose new points are to lie about as far apart, and how many these are, `count` in all.
 
-    Groups differ by a factor of 1.4 in spacing; one of fewer than `least` points joins the next.
+    Groups differ by a factor of 1.4 in spacing; one of fewer than `least` points joins the next. The
+    groups begin at the spacing `widest`, by default the largest there is.
     """
     spacing = np.sqrt(point_areas(points) / counts)
-    step = np.round(np.log(spacing / spacing.max()) / np.log(STEP)).astype(int)
+    step = np.round(np.log(spacing / (widest or spacing.max())) / np.log(STEP)).astype(int)
     groups: list[list[NDArray[np.int64]]] = []
     for value in np.unique(step):
         rows = np.flatnonzero(step == value)

@@ -192,7 +192,7 @@ def upsample(
     if keep not in (True, False, "auto"):
         raise ValueError(f"keep={keep}: expected true, false or auto")
     given, _, scanned = clean_cloud(given, outliers=outliers, lines="keep" if keep is True else lines, signs=signs)
-    network, target = _on_device(*_model(model, given.normals, scanned), device)
+    network, target = on_device(*_model(model, given.normals, scanned), device)
     upsampler = upsampler_of(network, patch_size)
     if devices > 1 and not getattr(upsampler, "parallel", False):
         raise ValueError(f"devices={devices}: {type(network).__name__} works in one process; leave devices=1")
@@ -478,7 +478,7 @@ def _model(model: Any, normals: np.ndarray | None, scanned: bool) -> tuple[Any, 
     return model, True
 
 
-def _on_device(model: Any, given: bool, device: str) -> tuple[Any, torch.device]:
+def on_device(model: Any, given: bool, device: str) -> tuple[Any, torch.device]:
     """The network on a device, and which; one that is given and lies elsewhere is copied, not moved."""
     tensors = [tensor for module in modules_of(model) for tensor in (*module.parameters(False), *module.buffers(False))]
     if device != "auto":

@@ -121,6 +121,8 @@ PLACES = {
     "commands/prepare.py next_line": "test_from_patches_to_a_picture",
     "training/run_folder.py line": "test_from_patches_to_a_picture",
     "commands/upsample.py upsample": "test_from_patches_to_a_picture",
+    "commands/_tiles.py upsample_in_tiles": "test_a_cloud_within_a_memory",  # in test_tiles.py
+    "commands/_tiles.py jobs": "test_tiles_as_jobs_give_the_same_bits",  # in test_tiles.py
     "commands/reconstruct.py reconstruct": "test_from_patches_to_a_picture",
     "commands/scan.py scan": "test_a_scan_then_a_picture",
     "commands/normals.py normals": "test_normals_then_a_denser_cloud",

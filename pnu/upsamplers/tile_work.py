@@ -1,0 +1,320 @@
+"""What is done with one tile of a large cloud, on its own: prepared, then made dense.
+
+Nothing but the plan and the facts of the prepared tiles enters, so tiles are made in any order, by any process of any
+machine that sees the folder, and always the same. Where tiles meet, `pnu.upsamplers.tile_seams` evens the points out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pnu.cleaning import stray_points
+from pnu.fast import accelerated
+from pnu.geometry.anisotropy import averaged
+from pnu.geometry.even_spacing import RANK, tangent_discs
+from pnu.geometry.farthest_blocks import decline_of
+from pnu.geometry.normal_estimation import complete_normals
+from pnu.geometry.normal_sides import seen_signs, voted_signs
+from pnu.geometry.point_tree import PointTree
+from pnu.geometry.sampling import farthest_points_large
+from pnu.geometry.unit_sphere import Frame, unit_sphere_frame
+from pnu.io import atomic_path, read_json, write_json
+from pnu.io.sensor import asked_sight
+from pnu.networks import checkpoints
+from pnu.networks.surface import Surface
+from pnu.runtime.progress import Progress, silent
+from pnu.upsamplers.context import Context
+from pnu.upsamplers.density import DENSITIES, SOME, THINNED, groups_of_like_spacing, point_areas
+from pnu.upsamplers.patches import with_unit_normals
+from pnu.upsamplers.surface_projection import SurfaceProjection
+from pnu.upsamplers.tile_plan import SMALLEST, Plan, attributes_of, structured
+from pnu.upsamplers.whole_clouds import evaluating, modules_of, on_device, output_count, weights_source
+
+SURPLUS = 0.01  # points made too many, so that an exact number is left where tiles come out a little different
+PLACES = 20_000  # of a tile, around which its area is measured
+SEEDS = 16  # around each of them
+REMEMBERED = 1000  # areas of a tile that stand for all
+EDGE = 0.65  # spacings that points are made beyond the last of a tile and its margin
+VOTES = 0.75  # spacings around a point of the coarse cloud where it tells the side
+
+
+def run_of(plan: Plan) -> str:
+    """The weights for all tiles of a plan."""
+    none_given = None if not plan.facts.given else np.empty((0, 3))
+    return str(weights_source(plan.keys.run, none_given, plan.facts.scanned))
+
+
+def loaded(run: str) -> Surface:
+    """The network of a run, which must be one that projects.
+
+    Raises:
+        ValueError: it is another one.
+    """
+    network = checkpoints.load(run)
+    if not isinstance(network, Surface):
+        raise ValueError(f"run={run}: takes the cloud as a whole, without memory= and tiles=; surface takes tiles")
+    return network
+
+
+@contextmanager
+def working(run: str, device: str = "auto") -> Iterator[SurfaceProjection]:
+    """The upsampler with the network of a run on a device, made fast, without gradients."""
+    network, _ = on_device(loaded(run), False, device)
+    with torch.no_grad(), evaluating(network), accelerated(modules_of(network)):
+        yield SurfaceProjection(network)
+
+
+class Share(NamedTuple):
+    """What a tile has of the whole, in the unit of the cloud."""
+
+    points: int  # that it has after cleaning,
+    area: float  # of the surface in its cell
+    areas: list[float]  # that some of its points stand for,
+    each: float  # as many points each
+    spread: float  # sum of all such areas of the points as they were read; 0 where nobody asks
+    stray: int
+
+
+def prepared(plan: Plan, number: int) -> None:
+    """A tile cleaned, with normals, and its share: files `cloud` and `share`."""
+    if plan.path("share", number, ".json").is_file():
+        return
+    keys, facts = plan.keys, plan.facts
+    rows = plan.region(number)
+    own = len(np.load(plan.path("points", number), mmap_mode="r"))
+    spread = float(point_areas(rows["point"])[:own].sum()) if keys.spacing is not None else 0.0
+    stray = stray_points(rows["point"]) if keys.outliers == "auto" else np.zeros(len(rows), bool)
+    strays = int(stray[:own].sum())
+    rows = rows[~stray]
+    if facts.lined is not None and len(rows) > SMALLEST:
+        kept = thinned_to(rows["point"], facts.lined)
+        moved = averaged(rows["point"], kept)
+        rows = rows[kept]
+        rows["point"] = moved
+    rows = rows[np.lexsort(rows["point"].T)]
+    points = rows["point"]
+    if len(rows) < SMALLEST:  # a few points in the air
+        normals = np.broadcast_to([0.0, 0.0, 1.0], (len(rows), 3))
+    else:
+        normals = _normals(plan, rows)
+    attributes = attributes_of(rows)
+    inside = plan.cells.inside(points, number)
+    share = Share(int(inside.sum()), 0.0, [], 0.0, spread, strays)
+    if share.points and len(rows) >= SMALLEST:
+        cloud, frame = in_unit_sphere(points, normals)
+        scale = float(frame.scale) ** 2
+        areas = point_areas(points)[inside]
+        some = np.sort(areas)[:: -(-len(areas) // REMEMBERED)]
+        area = surface_area(cloud, inside, partial(_known, plan, number, frame)) * scale
+        share = share._replace(area=area, areas=some.tolist(), each=share.points / len(some))
+    with atomic_path(plan.path("cloud", number)) as temporary:
+        np.save(temporary, structured(points, normals, attributes))
+    write_json(plan.path("share", number, ".json"), share._asdict())
+
+
+def thinned_to(points: NDArray[np.float64], distance: float) -> NDArray[np.int64]:
+    """Rows of those of the points (n, 3), ascending, that farthest points take down to a distance between them."""
+    n = len(points)
+    m = n
+    for share in (0.25, 0.5, 1.0):
+        m = max(math.ceil(share * n), min(n, 16))
+        order = farthest_points_large(points, m)
+        decline = decline_of(points[order], n)
+        if m == n or decline.distance[-1] < distance:
+            break
+    return np.sort(order[: max(round(min(decline.before(distance), m)), min(n, 16))])
+
+
+def _normals(plan: Plan, rows: NDArray[Any]) -> NDArray[np.float64]:
+    """A unit normal for each point, on the side that holds all over the cloud."""
+    facts, keys = plan.facts, plan.keys
+    given = rows["normal"] if facts.given else None
+    cloud, frame = in_unit_sphere(rows["point"], np.zeros((len(rows), 3)))
+    unit = cloud[:, :3]
+    known = np.zeros(len(rows), bool) if given is None else np.isfinite(given).all(1)
+    asked = asked_sight(keys.viewpoint, keys.up, keys.side)
+    anew = ~known | (keys.normals == "orient")
+    if keys.normals == "auto" and (asked is not None or facts.turned):
+        anew[:] = True
+    if given is not None and not anew.any():
+        return given
+    lines = complete_normals(unit, torch.from_numpy(given) if known.any() and given is not None else None).numpy()
+    if known.any() and not anew[known].any() and asked is None:
+        return lines  # those that were missing, to the side of the nearest
+    sight = plan.sight(attributes_of(rows))
+    if sight is not None and sight.inward is None:
+        place = sight.viewpoint
+        if place is not None:
+            place = (place - frame.center[0].numpy()) / float(frame.scale)
+            place = place[0] if sight.viewpoint is not None and sight.viewpoint.ndim == 1 else place
+        sign = seen_signs(unit.numpy(), lines, viewpoint=place, up=sight.up)
+    else:
+        sign = voted_signs(unit.numpy(), lines, _votes(plan, rows["point"], lines))
+    return lines * np.where(anew, sign, 1.0)[:, None]
+
+
+def _votes(plan: Plan, points: NDArray[np.float64], lines: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How the coarse cloud's normals speak for the lines at points (n, 3), (n,): 0 where it has none."""
+    coarse = plan.coarse()
+    distance, near = PointTree(coarse[:, :3]).nearest(points, 1)
+    votes: NDArray[np.float64] = (lines * coarse[near[:, 0], 3:]).sum(1)
+    votes[distance[:, 0] > VOTES * plan.facts.apart] = 0
+    return votes
+
+
+def in_unit_sphere(points: np.ndarray, normals: np.ndarray) -> tuple[Tensor, Frame]:
+    """A cloud (n, 6) in the unit sphere, and the way back."""
+    cloud = torch.from_numpy(np.hstack([points, normals]))
+    frame = unit_sphere_frame(cloud[None])
+    return frame.to_unit(cloud[None])[0], frame
+
+
+def surface_area(cloud: Tensor, inside: NDArray[np.bool_], known: Callable[[Tensor], NDArray[np.bool_]]) -> float:
+    """Area of the surface around those points of a cloud (n, 6) that are `inside`, (n,).
+
+    On a disc around each of some of them: the share that no other point is nearer to. known: which places (k, 3) count,
+    those where a point would be among the cloud.
+    """
+    rows = np.flatnonzero(inside)
+    some = rows[:: -(-len(rows) // PLACES)]
+    order = torch.from_numpy(np.concatenate([some, np.setdiff1d(np.arange(len(cloud)), some)]))
+    cloud = cloud[order]
+    discs = tangent_discs(cloud[:, :3], cloud[:, 3:], SEEDS, first=len(some))
+    tree = PointTree(cloud[:, :3].numpy())
+    radius = tree.nearest(cloud[: len(some), :3].numpy(), min(RANK, len(cloud) - 1) + 1)[0][:, -1]
+    nearest = tree.nearest(discs.reshape(-1, 3).numpy(), 1)[1].reshape(len(some), SEEDS)
+    counts = known(discs.reshape(-1, 3)).reshape(len(some), SEEDS)
+    own = (counts & (nearest == np.arange(len(some))[:, None])).mean(1)
+    return float((np.pi * radius**2 * own).sum() * len(rows) / len(some))
+
+
+def _known(plan: Plan, number: int, frame: Frame, places: Tensor) -> NDArray[np.bool_]:
+    """Which places (k, 3) in the unit sphere of a tile lie where it gets points, in cell and margin, (k,)."""
+    reach = plan.facts.margin + EDGE * plan.facts.apart
+    return plan.cells.inside(frame.from_unit(places[None])[0].numpy(), number, reach)
+
+
+class Whole(NamedTuple):
+    """What the shares of all tiles come to."""
+
+    points: int  # to be made
+    density: float  # of them in an area, where they are spread evenly; 0: after the points' own
+    level: float  # of `even_above_floor`: points in an area, and at least
+    floor: float  # so many a point
+    widest: float  # spacing of the points made, where it is widest
+    tiles: dict[int, Share]
+
+
+def whole_of(plan: Plan) -> Whole:
+    """The shares of all tiles together.
+
+    Raises:
+        ValueError: a tile is not prepared, or ratio and spacing ask for what cannot be.
+    """
+    keys, facts = plan.keys, plan.facts
+    shares = {number: Share(**read_json(plan.path("share", number, ".json"))) for number in plan.tiles}
+    ratio = keys.ratio
+    if keys.spacing is not None:
+        ratio = round(sum(share.spread for share in shares.values()) / keys.spacing**2) / facts.points
+        if ratio < 1:
+            raise ValueError(
+                f"spacing={keys.spacing:g}: the points are nearer to each other, {keys.spacing * ratio**0.5:.3g}; "
+                "give a smaller one"
+            )
+    count = output_count(facts.points, ratio)
+    left = sum(share.points for share in shares.values())
+    area = sum(share.area for share in shares.values())
+    if keys.density not in DENSITIES:
+        raise ValueError(f"density={keys.density}: expected {', '.join(DENSITIES)}")
+    areas = np.concatenate([share.areas or [0.0] for share in shares.values()])
+    weight = np.concatenate([np.full(max(len(share.areas), 1), share.each) for share in shares.values()])
+    total = float(weight @ areas)
+    if not total:
+        raise ValueError(f"{keys.input}: no tile has {SMALLEST} points; give more memory")
+    if keys.density == "follow":
+        return Whole(count, 0.0, 0.0, count / left, math.sqrt(areas.max() * left / count), shares)
+    even = count * areas / total
+    if keys.density == "even" or count < left or weight[even < THINNED].sum() < SOME * left:
+        return Whole(count, count / area, 0.0, 0.0, math.sqrt(area / count), shares)
+    level, floor = _level(areas, weight, count, left)
+    counts = np.maximum(floor, level * areas)
+    return Whole(count, 0.0, level, floor, float(np.sqrt(areas / counts).max()), shares)
+
+
+def _level(areas: np.ndarray, weight: np.ndarray, count: int, left: int) -> tuple[float, float]:
+    """As `even_above_floor` for areas that stand for several points each: points in an area, and at least a point."""
+    floor = math.sqrt(count / left)
+    low, high = 0.0, count / max(float(areas[areas > 0].min()), 1e-300)
+    for _ in range(200):
+        middle = (low + high) / 2
+        if float(weight @ np.maximum(floor, middle * areas)) > count:
+            high = middle
+        else:
+            low = middle
+    return low, floor
+
+
+def made(plan: Plan, number: int, whole: Whole, upsampler: SurfaceProjection, progress: Progress = silent) -> None:
+    """A tile made dense, all tiles being prepared: file `made`, the points in its cell, those kept first."""
+    if plan.path("made", number).is_file():
+        return
+    facts = plan.facts
+    rows = np.load(plan.path("cloud", number))
+    if whole.tiles[number].area == 0:
+        _save(plan, number, np.empty((0, 6)), 0)
+        return
+    cloud, frame = in_unit_sphere(rows["point"], rows["normal"])
+    device = next(upsampler.network.parameters()).device
+    context = Context(device, progress=progress, keep=facts.keep)
+    measured = smooth = upsampler.with_refined_normals(cloud.to(device), upsampler.network.passes, context)
+    if facts.smooth and not facts.keep:
+        smooth, _ = upsampler.projected(measured, measured, context, "smoothing, the points are noisy")
+    found: list[Tensor] = []
+    kept = 0
+    for group, count in _groups(rows["point"], cloud, frame, whole, partial(_known, plan, number, frame)):
+        others = np.setdiff1d(np.arange(len(cloud)), group)
+        fixed = measured[group] if facts.keep else measured[:0]
+        order = np.concatenate([group, others])
+        raw = upsampler.spread(smooth[order], fixed, len(group), max(count, len(fixed)), context)
+        dense = with_unit_normals(raw.cpu().double(), smooth.cpu())
+        dense = frame.from_unit(dense[None])[0]
+        if facts.keep:
+            dense[: len(group), :3] = torch.from_numpy(rows["point"][group])
+            given = torch.from_numpy(rows["normal"][group])
+            if facts.given:
+                dense[: len(group), 3:] = given
+            kept += int(plan.cells.inside(rows["point"][group], number).sum())
+            found.insert(0, dense[: len(group)])
+            found.append(dense[len(group) :])
+        else:
+            found.append(dense)
+    points = torch.cat(found).numpy()
+    _save(plan, number, points[plan.cells.inside(points[:, :3], number)], kept)
+
+
+def _save(plan: Plan, number: int, dense: np.ndarray, kept: int) -> None:
+    write_json(plan.path("kept", number, ".json"), kept)
+    with atomic_path(plan.path("made", number)) as temporary:
+        np.save(temporary, dense)
+
+
+def _groups(
+    points: NDArray[np.float64], cloud: Tensor, frame: Frame, whole: Whole, known: Callable[[Tensor], NDArray[np.bool_]]
+) -> list[tuple[NDArray[np.int64], int]]:
+    """Rows of points (n, 3) whose new points lie about as far apart, and how many these are."""
+    everything = np.arange(len(points))
+    if whole.density:
+        area = surface_area(cloud, np.ones(len(points), bool), known) * float(frame.scale) ** 2
+        return [(everything, round((1 + SURPLUS) * whole.density * area))]
+    areas = point_areas(points)
+    counts = (1 + SURPLUS) * np.maximum(whole.floor, whole.level * areas)
+    return groups_of_like_spacing(points, counts, round(float(counts.sum())), widest=whole.widest)

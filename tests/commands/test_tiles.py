@@ -1,0 +1,113 @@
+"""`pnu upsample` of clouds in tiles: within a memory, in jobs, and what it refuses."""
+
+import shlex
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pnu.commands import _tiles
+from pnu.commands.upsample import main
+from pnu.config.compose import parse
+from pnu.config.quoting import override
+from pnu.io import read_cloud, write_cloud
+from tests.refusals import ran, refused
+
+NASTY = "it's a=b, (c)"
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a cloud of 300 points with intensities, of which tiles hold 160, as of a large one."""
+    xy = np.random.default_rng(0).uniform(0, 17, (300, 2))
+    points = np.column_stack([xy, np.sin(xy[:, 0] / 9)])
+    write_cloud(tmp_path / "cloud.ply", points, None, {"intensity": np.arange(300, dtype=np.uint16)})
+    monkeypatch.setattr(_tiles, "tile_size", lambda memory, ratio: 160)
+    return tmp_path
+
+
+def tiled(place: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return ran(main, place, "input=cloud.ply", "ratio=2", "up=z", *arguments)
+
+
+def test_a_cloud_within_a_memory(place: Path) -> None:
+    (place / NASTY).mkdir()
+    done = tiled(place, override("output", f"{NASTY}/dense.ply"), "memory=4GiB")
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[0] == "input:  cloud.ply, 300 points, normals estimated and oriented"
+    assert lines[1] == "run:    surface_estimated"
+    assert lines[2].startswith("tiles:  2, of at most 150 points and a margin of ")
+    assert lines[3] == "        carried over: intensity"
+    assert lines[4].startswith(f"output: {NASTY}/dense.ply, 600 points with unit normals, ")
+    following, program, verb, *arguments = shlex.split(lines[5])
+    assert (following, program, verb) == ("next:", "pnu", "reconstruct")
+    assert [one.value() for one in parse(arguments)] == [f"{NASTY}/dense.ply", "mesh.ply"]
+    cloud = read_cloud(place / NASTY / "dense.ply")
+    assert len(cloud.points) == 600
+    assert cloud.normals is not None
+    assert (cloud.normals[:, 2] > 0).all()
+    assert set(cloud.attributes) == {"intensity"}
+    assert [path.name for path in (place / NASTY).iterdir()] == ["dense.ply"]
+
+
+def test_tiles_as_jobs_give_the_same_bits(place: Path) -> None:
+    assert tiled(place, "output=whole.ply", "tiles=all", "quiet=true").returncode == 0
+    (place / NASTY).mkdir()
+    done = tiled(place, "-m", override("output", f"{NASTY}/jobs.ply"), "tiles=all")
+    assert done.returncode == 0, done.stderr
+    done_by_jobs = [line.partition(", ")[0] for line in done.stdout.splitlines() if line.startswith("tile ")]
+    both = ["tile 0 of 2", "tile 1 of 2"]
+    assert done_by_jobs == [f"{tile}: {what}" for what in ("prepared", "made") for tile in both]
+    assert (place / NASTY / "jobs.ply").read_bytes() == (place / "whole.ply").read_bytes()
+    assert [path.name for path in (place / NASTY).iterdir()] == ["jobs.ply"]
+
+
+def test_single_tiles_by_hand(place: Path) -> None:
+    done = tiled(place, "output=dense.ply", "tiles=1")
+    assert done.returncode == 2
+    assert "error: tiles=1: there is no plan in dense.ply.parts/tiles_" in done.stderr
+    assert "begin with tiles=plan and the same keys" in done.stderr
+    assert "        numbers 0 1" in tiled(place, "output=dense.ply", "tiles=plan").stdout
+    assert tiled(place, "output=dense.ply", "tiles=1").stdout.startswith("tile 1 of 2: prepared, ")
+    assert tiled(place, "output=dense.ply", "tiles=1").stdout.startswith("tile 1 of 2: is prepared, others are not yet")
+    assert tiled(place, "output=dense.ply", "tiles=0").stdout.startswith("tile 0 of 2: prepared, ")
+    assert tiled(place, "output=dense.ply", "tiles=1").stdout.startswith("tile 1 of 2: made, ")
+    assert "tiles=7: expected one of 2 tiles, 0 to 1" in tiled(place, "output=dense.ply", "tiles=7").stderr
+    assert tiled(place, "output=dense.ply", "tiles=all").returncode == 0
+    assert len(read_cloud(place / "dense.ply").points) == 600
+
+
+BAD = {
+    "memory=much": "memory=much: expected a size such as 4GiB or 1500MiB",
+    "memory=100MiB": "memory=100MiB: is too little for this ratio; expected at least ",
+    "memory=4GiB holes=1": "holes=1.0: takes the cloud as a whole; leave it out, or memory= and tiles=",
+    "memory=4GiB devices=2": "devices=2: takes the cloud as a whole; leave it out, or memory= and tiles=",
+    "memory=4GiB run=apss": "run=apss: takes the cloud as a whole, without memory= and tiles=; surface takes tiles",
+    "memory=4GiB output=a.xyz": "a.xyz: .xyz is not written in parts, as memory= and tiles= want it; take one of",
+    "memory=4GiB input=no.las": "no.las: no such file; give the path of a point cloud",
+    "memory=4GiB input=no.xyz": "no.xyz: .xyz is not read in slices, as memory= and tiles= want it; pnu convert",
+    "tiles=some": "tiles=some: expected all, plan or the number of a tile",
+    "-m tiles=all ratio=2,3": "tiles=all: makes the jobs of one run; give each key one value",
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_one_line(
+    tmp_path: Path, case: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.save("cloud.npy", np.random.default_rng(0).normal(size=(100, 3)))
+    given = {"input": "cloud.npy", "output": "dense.ply"}
+    given |= dict(word.split("=") for word in case.split() if word != "-m")
+    line = refused(capsys, main, [*["-m"] * ("-m" in case), *(f"{key}={value}" for key, value in given.items())])
+    assert line.startswith(f"error: {BAD[case]}")
+    assert [path.name for path in tmp_path.iterdir()] == ["cloud.npy"]
+
+
+def test_memory_sets_the_size_of_tiles() -> None:
+    small, large = _tiles.tile_size("2GiB", 4), _tiles.tile_size("4 gb", 4)
+    assert 3 * small > large > 2 * small
+    assert _tiles.tile_size("4096MiB", 4) == large
+    assert _tiles.tile_size("4GiB", 1) > large
