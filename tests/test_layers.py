@@ -16,6 +16,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "pnu"
 # From the ground up. A file imports only from rooms before its own, and from its own.
 ROOMS = [
     *(
+        "extras",
         "io",
         "config",
         "weights",

@@ -117,7 +117,7 @@ class PNU(nn.Module):
         predicted: Tensor = (
             points.unflatten(1, (n, *[2] * steps))
             .permute(0, *range(steps + 1, 0, -1), -1)
-            .reshape(len(patch), -1, points.shape[-1])
+            .reshape(patch.shape[0], -1, points.shape[-1])
         )
         if not self.residual:
             return predicted

@@ -126,7 +126,7 @@ PLACES = {
     "commands/reconstruct.py reconstruct": "test_from_patches_to_a_picture",
     "commands/scan.py scan": "test_a_scan_then_a_picture",
     "commands/normals.py normals": "test_normals_then_a_denser_cloud",
-    "commands/export.py export": "test_weights_kept_as_a_file",
+    "commands/export.py as_safetensors": "test_weights_kept_as_a_file",
     "commands/convert.py convert": "test_weights_of_the_released_code",
     "commands/_normal_task.py evaluate_task": "test_normals_measured_then_made",
     "commands/evaluate.py evaluate": "test_an_evaluation_then_a_comparison",

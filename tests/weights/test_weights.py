@@ -39,8 +39,12 @@ def test_exported_weights_are_those_of_the_run(place: Path, capsys: pytest.Captu
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["run=run", "output=small.pt"], "output=small.pt: expected a name that ends with .safetensors"),
+        (["run=run", "output=small.pt"], "output=small.pt: expected a name that ends with .safetensors or .onnx"),
         (["run=run", "output=no/a.safetensors"], "output=no/a.safetensors: the folder no does not exist"),
+        (
+            ["run=run", "output=a.onnx", "format=safetensors"],
+            "output=a.onnx: expected a name that ends with .safetensors",
+        ),
         (["run=nothing", "output=a.safetensors"], "run=nothing: expected a run folder"),
     ],
 )

@@ -1,0 +1,38 @@
+"""Packages that only some uses need: which extra of pnu brings each, and one line where it is missing.
+
+with needed("training"):
+    import lightning
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+# package -> the extra of pnu that brings it
+EXTRAS = {
+    **dict.fromkeys(("onnx", "onnxruntime", "onnxscript"), "onnx"),
+}
+
+
+class MissingExtra(ModuleNotFoundError, ValueError):
+    """A package is not installed, and which extra brings it; at the command line one line and exit code 2."""
+
+
+@contextmanager
+def needed(purpose: str) -> Iterator[None]:
+    """Imports of packages in `EXTRAS`; where one is not installed, it is said for what it is needed, and the cure.
+
+    Raises:
+        MissingExtra: the package is not there.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        package = (error.name or "").split(".")[0]
+        if isinstance(error, MissingExtra) or package not in EXTRAS:
+            raise
+        raise MissingExtra(missing(package, purpose), name=error.name) from None
+
+
+def missing(package: str, purpose: str) -> str:
+    """What is said where a package is not installed."""
+    return f'{purpose} needs {package}, which is not installed: pip install "pnu[{EXTRAS[package]}]"'
