@@ -1,21 +1,30 @@
 """Draw clouds and meshes side by side: `pnu picture inputs=[dense.ply,mesh.ply] output=figure.png`."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from pnu.commands._entry import command
 from pnu.config.schema import doc
+from pnu.runtime.progress import stages
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from pnu.rendering import Camera
 
 
 @dataclass
 class Picture:
-    """Draw clouds and meshes side by side, seen from the same side, as PNG; no display or graphics card is needed."""
+    """Draw clouds and meshes side by side, seen from the same side, as PNG, or turning, as animated WebP; no display or
+    graphics card is needed."""
 
     commas: ClassVar = ("columns",)
     inputs: list[str] = doc("files to draw, a panel each: [a.ply,b.obj,...]; with faces as meshes, others as clouds")
-    output: str = doc("png to write")
+    output: str = doc("png to write; with frames=36 an animated webp")
     captions: list[str] | None = doc("a caption for each panel; null: the names of the files")
     panels: int | None = doc("in a row; null: all, up to six")
     columns: str | None = doc(
@@ -31,6 +40,7 @@ class Picture:
     azimuth: float = doc("degrees that the shape is turned about the axis up=")
     elevation: float = doc("degrees that the camera looks from above")
     up: str = doc("axis that points up: x, y or z")
+    frames: int = doc("pictures of a whole turn about it, six seconds long; 1: one picture")
     radius: float | None = doc("of a cloud's points, in the unit of the file; null: by their spacing")
     smooth: bool = doc("meshes: smooth shading, false: each triangle flat")
     size: int = doc("pixels of a panel's side")
@@ -67,8 +77,12 @@ def picture(cfg: Any) -> None:
         )
     if not 16 <= cfg.size <= 4096:
         raise ValueError(f"size={cfg.size}: expected 16 to 4096 pixels")
-    if Path(cfg.output).suffix.lower() != ".png":
-        raise ValueError(f"output={cfg.output}: expected a name that ends in .png")
+    if not 1 <= cfg.frames <= 360:
+        raise ValueError(f"frames={cfg.frames}: expected 1 to 360")
+    suffix = ".png" if cfg.frames == 1 else ".webp"
+    if Path(cfg.output).suffix.lower() != suffix:
+        still = f"; frames={cfg.frames} are an animation" if cfg.frames > 1 else "; frames=36 makes an animated .webp"
+        raise ValueError(f"output={cfg.output}: expected a name that ends in {suffix}{still}")
     check_writable(cfg.output)
     columns = columns_of(inputs, cfg.columns, "inputs")
     shapes = [read_shape(path, names) for path, names in zip(inputs, columns, strict=True)]
@@ -76,15 +90,24 @@ def picture(cfg: Any) -> None:
     points = [shape.points for shape in shapes]
     apart = cfg.fit is None and not rendering.in_one_place(*points)
     side = {"azimuth": cfg.azimuth, "elevation": cfg.elevation, "up": cfg.up}
-    one = rendering.look_at(*(points if cfg.fit == 0 else [points[(cfg.fit or 1) - 1]]), **side)
-    cameras = [rendering.look_at(own, **side) if apart else one for own in points]
-    panels = [
-        shape.draw(camera, cfg.color, bar, size=cfg.size, radius=cfg.radius, smooth=cfg.smooth)
-        for shape, camera in zip(shapes, cameras, strict=True)
-    ]
+    one = points if cfg.fit == 0 else [points[(cfg.fit or 1) - 1]]
+    views = [views_of(own, cfg.frames, side) for own in ([[p] for p in points] if apart else [one])]
     names = [Path(path).stem for path in inputs] if captions is None else list(captions)
-    image = rendering.figure(panels, names, columns=cfg.panels, colorbar=bar)
-    rendering.save_png(cfg.output, image)
+    pictures = []
+    with stages(cfg.quiet or cfg.frames == 1) as progress:
+        for number in range(cfg.frames):
+            cameras = [own[number] for own in views] if apart else [views[0][number]] * len(points)
+            panels = [
+                shape.draw(camera, cfg.color, bar, size=cfg.size, radius=cfg.radius, smooth=cfg.smooth)
+                for shape, camera in zip(shapes, cameras, strict=True)
+            ]
+            image = rendering.figure(panels, names, columns=cfg.panels, colorbar=bar, crop=cfg.frames == 1)
+            pictures.append(image)
+            progress("drawing", number + 1, cfg.frames)
+    if cfg.frames == 1:
+        rendering.save_png(cfg.output, image)
+    else:
+        rendering.save_animation(cfg.output, pictures)
     if not cfg.quiet:
         kinds = (f"{'mesh' if s.mesh is not None else 'cloud'}, color={s.source(cfg.color)}" for s in shapes)
         print(f"panels: {', '.join(f'{path} ({kind})' for path, kind in zip(inputs, kinds, strict=True))}")
@@ -94,7 +117,15 @@ def picture(cfg: Any) -> None:
             for note in shape.notes:
                 print(f"        {shape.path}: {note}")
         height, width = image.shape[:2]
-        print(f"output: {cfg.output}, {width} x {height} pixels, {time.perf_counter() - started:.1f} s")
+        turn = f"{cfg.frames} pictures of " if cfg.frames > 1 else ""
+        print(f"output: {cfg.output}, {turn}{width} x {height} pixels, {time.perf_counter() - started:.1f} s")
+
+
+def views_of(points: Sequence["NDArray[np.float64]"], frames: int, side: dict[str, Any]) -> list["Camera"]:
+    """The cameras that see all points, one a frame."""
+    from pnu import rendering
+
+    return [rendering.look_at(*points, **side)] if frames == 1 else rendering.turntable(*points, frames=frames, **side)
 
 
 main = command(picture, Picture)

@@ -63,3 +63,18 @@ def look_at(
     low, high = seen.min(0), seen.max(0)
     half_size = max((high - low)[:2].max() / 2, 1e-12 * np.abs(seen).max(), 1e-300)
     return Camera(rotation, rotation.T @ ((low + high) / 2), margin * half_size)
+
+
+def turntable(
+    *points: np.ndarray, frames: int, azimuth: float = 30, elevation: float = 15, up: str = "y"
+) -> list[Camera]:
+    """Cameras of a whole turn about the axis `up`, which begins at `azimuth`; each sees all `points` at one scale."""
+    cameras = [
+        look_at(*points, azimuth=azimuth + 360 * number / frames, elevation=elevation, up=up)
+        for number in range(frames)
+    ]
+    everything = np.concatenate([p[:, :3] for p in points])
+    center = (everything.min(0) + everything.max(0)) / 2
+    reach = max(np.abs(((everything - center) @ camera.rotation.T)[:, :2]).max() for camera in cameras)
+    half_size = max(1.04 * reach, max(camera.half_size for camera in cameras))
+    return [camera._replace(center=center, half_size=half_size) for camera in cameras]

@@ -90,6 +90,20 @@ def save_png(path: str | Path, picture: Picture) -> None:
         Image.fromarray(picture).save(temporary, dpi=(300, 300))
 
 
+def save_animation(path: str | Path, pictures: Sequence[Picture], seconds: float = 6) -> None:
+    """Write pictures of one size atomically as an animated WebP that goes round. ValueError where one is blank."""
+    if Path(path).suffix.lower() != ".webp":
+        raise ValueError(f"{path}: animations are written as .webp; name the output so")
+    if not all(map(is_drawn, pictures)):
+        raise ValueError(f"{path}: a picture would be blank; it is not written")
+    first, *others = map(Image.fromarray, pictures)
+    with atomic_path(path) as temporary:
+        first.save(
+            temporary, "WEBP", save_all=True, append_images=others, duration=round(1000 * seconds / len(pictures)),
+            loop=0, quality=80, method=6,
+        )  # fmt: skip
+
+
 def webp(picture: Picture, quality: int = 90) -> bytes:
     """A picture as WebP: a tenth of the PNG's bytes, at 90 no difference to be seen."""
     buffer = io.BytesIO()

@@ -1,6 +1,7 @@
 """The commands reconstruct and picture on real files."""
 
 import re
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -137,10 +138,25 @@ def test_picture_of_files(folder: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert np.ptp(tall.astype(int), axis=2).max() < 40
 
 
+def test_a_whole_turn_is_an_animation(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run(picture, inputs=f"[{folder}/cloud.ply,{folder}/mesh.ply]", output=tmp_path / "a.webp", size=60, frames=3)
+    assert "a.webp, 3 pictures of " in capsys.readouterr().out
+    with Image.open(tmp_path / "a.webp") as turning:
+        assert (turning.n_frames, turning.info["loop"]) == (3, 0)
+        frames = []
+        for number in range(3):
+            turning.seek(number)
+            frames.append(np.asarray(turning.convert("L")).astype(int))
+    assert all(np.abs(a - b).mean() > 1 for a, b in itertools.pairwise(frames))
+
+
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
         ({"inputs": "[]"}, "expected one file or more"),
+        ({"output": "a.webp"}, r"ends in \.png; frames=36 makes an animated \.webp"),
+        ({"frames": 8}, r"ends in \.webp; frames=8 are an animation"),
+        ({"frames": 0}, "frames=0: expected 1 to 360"),
         ({"output": "a.jpg"}, r"ends in \.png"),
         ({"captions": "[a,b]"}, "found 2 for 1 inputs"),
         ({"fit": 2}, "fit=2: expected a panel, 1 to 1"),

@@ -11,7 +11,18 @@ from pnu.commands.picture import main as picture
 from pnu.geometry.mesh_topology import corner_normals, split_creases
 from pnu.geometry.spacing import spacing
 from pnu.io import Mesh, write_cloud
-from pnu.rendering import Camera, ColorBar, figure, in_one_place, look_at, raster, render_cloud, render_mesh, save_png
+from pnu.rendering import (
+    Camera,
+    ColorBar,
+    figure,
+    in_one_place,
+    look_at,
+    raster,
+    render_cloud,
+    render_mesh,
+    save_png,
+    turntable,
+)  # fmt: skip
 from pnu.rendering.colors import LMS, RGB, linear_light, normal_colors, srgb, value_colors
 from pnu.rendering.figure import colorbar_figure, draw_colorbar, extent
 from pnu.rendering.render import in_front
@@ -89,6 +100,16 @@ def test_camera_sees_everything_and_mirrors_nothing() -> None:
         assert np.linalg.det(camera.rotation) == pytest.approx(1)
         straight = look_at(points, azimuth=0, elevation=0, up=up)
         np.testing.assert_allclose(straight.rotation[1], np.eye(3)["xyz".index(up)], atol=1e-12)
+
+
+def test_a_turntable_keeps_scale_and_center_and_sees_everything() -> None:
+    points = np.random.default_rng(2).normal(size=(300, 3)) * [3, 1, 0.2] + [50, 0, 0]
+    cameras = turntable(points, frames=8, azimuth=20, up="z")
+    for number, camera in enumerate(cameras):
+        np.testing.assert_allclose(camera.rotation, look_at(points, azimuth=20 + 45 * number, up="z").rotation)
+        assert np.abs(camera.view(points)[:, :2]).max() < 1
+    assert len({(camera.half_size, *camera.center) for camera in cameras}) == 1
+    assert max(np.abs(camera.view(points)[:, :2]).max() for camera in cameras) > 0.9
 
 
 def test_mesh_covers_its_projection_and_shades_with_light_from_above() -> None:
