@@ -22,6 +22,7 @@ class ProjectionDataModule(EpochDataModule):
         scans: share of the clouds that are simulated scans
         blue: share of the other clouds whose points keep a distance, as blue noise
         least: points of the smallest clouds
+        noise: largest standard deviation, in radii, of the noise of clouds whose normals are estimated; half have none
         clouds: of an epoch, each drawn anew
         size: points of a crop
         views: crops of a cloud
@@ -37,7 +38,8 @@ class ProjectionDataModule(EpochDataModule):
     def __init__(
         self, root: str | None = None, procedural: bool = True, validation: Iterable[str] = (),
         normals: Literal["given", "estimated", "mixed"] = "given",
-        scans: float = 0.0, blue: float = 0.15, least: int = LEAST, clouds: int = 6400, size: int = 384, views: int = 2,
+        scans: float = 0.0, blue: float = 0.15, least: int = LEAST,
+        noise: float = 0.02, clouds: int = 6400, size: int = 384, views: int = 2,
         batch_size: int = 8, points: int = 2048, workers: int = 0, seed: int = 0,
     ) -> None:  # fmt: skip
         super().__init__(batch_size, workers, seed)
@@ -45,7 +47,7 @@ class ProjectionDataModule(EpochDataModule):
             raise ValueError(f"data.points={points}: expected at least {SMALLEST}")
         self.evaluation_batch_size = 1
         self.root, self.procedural, self.held_out = root, procedural, list(validation)
-        self.scans, self.blue, self.least = scans, blue, least
+        self.scans, self.blue, self.least, self.noise = scans, blue, least, noise
         self.normals, self.clouds, self.size, self.views, self.points = normals, clouds, size, views, points
         self.truth: MeshScene | None = None
 
@@ -80,6 +82,7 @@ class ProjectionDataModule(EpochDataModule):
             scans=self.scans,
             blue=self.blue,
             least=self.least,
+            noise=self.noise,
             seed=self.seed,
         )
         clouds = {

@@ -37,6 +37,8 @@ AROUND = 8  # points of which one at most is dropped,
 DOUBTFUL = 16  # looked for among so many for each point to drop
 ROOM = 0.7  # around a point that is kept, in spacings that evenly spread points would have
 LONG = 10_000  # points made from which on a computation takes long enough to have kernels compiled beside it
+SPACED = 6  # neighbors whose mean distance is the spacing at a point of the cloud,
+COVERED = 0.5  # of which so much may lie between it and the nearest point made
 CLOSE = 12  # neighbors of the sphere that candidates are first moved to
 
 
@@ -109,8 +111,23 @@ class SurfaceProjection:
             query = named("even spacing", lambda step: even_out(query, network.relaxation, step, kept))
         for i in range(network.refinements):
             query, error = self.projected(query, cloud, context, f"refinement {i + 1}")
-        query = query[reject_worst(query[:, :3], error, new)]
+        query = self.covering(query[reject_worst(query[:, :3], error, new)], kept, cloud, first, context)
         return torch.cat([self.with_normals(kept, cloud, context), query]) if len(kept) else query
+
+    def covering(self, query: Tensor, kept: Tensor, cloud: Tensor, first: int, context: Context) -> Tensor:
+        """Points (m, 6) of which one lies within half a spacing of each of the first points of a cloud (n, 6).
+
+        Where neither they nor those that are kept do, the cloud's own point comes, projected, and one that stands
+        close to others and covers nothing alone goes.
+        """
+        bare = uncovered(cloud[:first, :3], torch.cat([query[:, :3], kept[:, :3]]))
+        spare = dispensable(query[:, :3], cloud[:first, :3])[: len(bare)]
+        if not len(spare):
+            return query
+        added, _ = self.projected(cloud[bare[: len(spare)]], cloud, context, "places without points")
+        stays = torch.ones(len(query), dtype=torch.bool, device=query.device)
+        stays[spare] = False
+        return torch.cat([query[stays], added])
 
     def projected(self, query: Tensor, cloud: Tensor, context: Context, stage: str) -> tuple[Tensor, Tensor]:
         """Queries (m, 6) on the surface of a cloud (n, 6), and the logarithm of their expected error (m,)."""
@@ -269,6 +286,28 @@ def reject_worst(points: Tensor, error: Tensor, count: int) -> Tensor:
     stays = torch.ones_like(error, dtype=torch.bool)
     stays[torch.cat([doubtful[worst], doubtful[~worst]])[:surplus]] = False
     return stays.nonzero()[:, 0]
+
+
+def uncovered(points: Tensor, cloud: Tensor) -> Tensor:
+    """Rows (k,) of points (n, 3) without one of a cloud (m, 3) within half of their spacing, the barest first."""
+    near = knn(points[None], points[None], min(SPACED + 1, len(points))).dist_sq[0, :, 1:]
+    share = nearest(points[None], cloud[None]).dist_sq[0].sqrt() / near.sqrt().mean(1).clamp_min(1e-300)
+    order = share.argsort(descending=True, stable=True)
+    return order[: int((share > COVERED).sum())]
+
+
+def dispensable(cloud: Tensor, points: Tensor) -> Tensor:
+    """Rows (k,) of a cloud (m, 3) that are nearest to none of the points (n, 3), the most crowded first.
+
+    Of two that are each other's nearest one alone.
+    """
+    found = knn(cloud[None], cloud[None], 2)
+    other, apart = found.idx[0, :, 1], found.dist_sq[0, :, 1]
+    rows = torch.arange(len(cloud), device=cloud.device)
+    spare = torch.ones_like(rows, dtype=torch.bool)
+    spare[nearest(points[None], cloud[None]).idx[0]] = False
+    spare &= ~((other[other] == rows) & (other < rows) & spare[other])
+    return rows[spare][apart[spare].argsort(stable=True)]
 
 
 def even_out(cloud: Tensor, steps: int, step: Step = silent, kept: Tensor | None = None) -> Tensor:

@@ -1,7 +1,7 @@
 """The commands reconstruct and picture on real files."""
 
-import re
 import itertools
+import re
 from pathlib import Path
 
 import numpy as np

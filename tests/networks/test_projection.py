@@ -14,7 +14,7 @@ from pnu.geometry.transforms import rotation_matrix
 from pnu.networks.surface import Projector, Surface
 from pnu.upsamplers import Context, SurfaceProjection
 from pnu.upsamplers import surface_projection as procedure
-from pnu.upsamplers.surface_projection import reject_worst
+from pnu.upsamplers.surface_projection import dispensable, reject_worst, uncovered
 
 
 def upsample(network: Surface, cloud: Tensor, count: int, **options: Any) -> Tensor:
@@ -248,6 +248,7 @@ def test_most_doubtful_points_are_dropped(monkeypatch: pytest.MonkeyPatch) -> No
         return every["last"]
 
     monkeypatch.setattr(procedure, "in_parts", spy)
+    monkeypatch.setattr(SurfaceProjection, "covering", lambda self, query, *others: query)
     dense = upsample(model, cloud, 600)
     points, error = every["last"]
     assert len(points) == 606
@@ -273,6 +274,14 @@ def test_count_is_exact_however_many_are_dropped(count: int) -> None:
     stays = reject_worst(sphere(20)[:, :3], torch.arange(20.0).flip(0), count)
     assert len(stays) == count
     assert stays.equal(stays.unique())
+
+
+def test_what_is_bare_and_what_can_go() -> None:
+    points = torch.stack([torch.arange(20.0), torch.zeros(20), torch.zeros(20)], 1).double()  # spacing 2 in the middle
+    cloud = torch.cat([points[:10] + 0.1, points[13:] + 0.2, points[:2] + 0.15])
+    assert uncovered(points, cloud).tolist() == [11, 12]
+    # nearest to none are the two doubles
+    assert sorted(dispensable(cloud, points).tolist()) == [17, 18]
 
 
 def test_some_crops_in_training_get_normals_of_the_network_s_own() -> None:
@@ -361,10 +370,10 @@ def test_every_stage_of_a_large_run_moves(monkeypatch: pytest.MonkeyPatch) -> No
     steps: dict[str, list[tuple[int, int]]] = {}
     upsample(Surface(), sphere(600), 2400, progress=lambda stage, *step: steps.setdefault(stage, []).append(step))
     stages = ["seeds", "spheres", "shortlist", "projection", "thinning", "even spacing", "refinement 1", "refinement 2"]
-    assert list(steps) == stages
+    assert list(steps) == [*stages, "places without points"]
     for stage, told in steps.items():
         done, total = zip(*told, strict=True)
-        assert len(set(done)) > 4, stage
+        assert len(set(done)) > 4 or stage == "places without points", stage
         assert max(done) == done[-1] == total[-1]
 
 

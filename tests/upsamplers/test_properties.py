@@ -6,6 +6,7 @@ candidates are kept may differ after a rotation or another rounding; where the s
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-def upsample(points: Array, normals: Array | None, ratio: float = 2, **options: int) -> Array:
+def upsample(points: Array, normals: Array | None, ratio: float = 2, **options: Any) -> Array:
     return pnu.upsample(points, normals, ratio=ratio, model="surface", **options)
 
 
@@ -206,6 +207,16 @@ def measured(names: list[str]) -> dict[str, dict[str, float]]:
     meshes = {name: (lambda name=name: shapes.make(name)) for name in names}
     drawn = benchmark.mesh_cases(meshes, ["random"], points=200, truth_points=800, warn=lambda text: None)
     return {case.truth.shape: benchmark.measure(np.hstack([case.points, case.normals]), case.truth) for case in drawn}
+
+
+@pytest.mark.parametrize(("shape", "ratio", "given"), [("mug", 2, True), ("horse", 4, False), ("urchin", 7.3, True)])
+def test_every_point_given_has_one_within_half_a_spacing(shape: str, ratio: float, given: bool) -> None:
+    cloud = sample_area(shapes.make(shape), 400, np.random.default_rng(5))
+    dense = upsample(cloud[:, :3], cloud[:, 3:] if given else None, ratio, keep=False, outliers="keep")
+    around = cKDTree(cloud[:, :3]).query(cloud[:, :3], 7)[0][:, 1:].mean(1)
+    share = cKDTree(dense[:, :3]).query(cloud[:, :3])[0] / around
+    assert (share > 0.5).mean() < 0.005  # a tip may end a little before its point
+    assert share.max() < 0.7
 
 
 def test_metrics_depend_neither_on_threads_nor_on_the_order_of_files() -> None:
