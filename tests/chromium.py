@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -118,7 +119,18 @@ def chromium(profile: Path) -> Iterator[Browser]:
     there, writing = os.pipe()
     reading, back = os.pipe()
     # the browser reads what it is told from descriptor 3 and answers on 4
-    command = ["sh", "-c", f'exec "$@" 3<&{there} 4>&{back}', "sh", str(CHROMIUM), *FLAGS, f"--user-data-dir={profile}"]
+    moved = "import fcntl, os, sys; there, back = (fcntl.fcntl(int(n), fcntl.F_DUPFD, 10) for n in sys.argv[1:3]); "
+    moved += "os.dup2(there, 3); os.dup2(back, 4); os.execv(sys.argv[3], sys.argv[3:])"
+    command = [
+        sys.executable,
+        "-ISc",
+        moved,
+        str(there),
+        str(back),
+        str(CHROMIUM),
+        *FLAGS,
+        f"--user-data-dir={profile}",
+    ]
     process = subprocess.Popen(
         [*command, "about:blank"], pass_fds=(there, back), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )

@@ -145,6 +145,8 @@ def run_line(folder: Path, line: str) -> None:
         arguments = ["train", *arguments[2:]]
     else:
         assert program == "pnu", line
+    if arguments[:1] == ["app"] or (arguments[0] == "view" and "page=" not in line):  # serve until stopped
+        arguments = [arguments[0], "--help"]
     if open3d_error():  # its system libraries are missing; tested in test_reconstruct.py
         if arguments[0] == "reconstruct":
             return

@@ -138,6 +138,12 @@ class Viewer {
     return view.items.map((item) => ({ name: item.name, points: geometry(item.cloud), surface: geometry(item.surface) }));
   }
 
+  async forget(view) {
+    const items = (await this.loaded.get(view)) || [];
+    this.loaded.delete(view);
+    for (const item of items) for (const drawing of [item.points, item.surface]) if (drawing) drawing.geometry.remove();
+  }
+
   show(state) { this.state = state; this.last = ""; this.frame(); }
 
   frame() {
@@ -166,7 +172,7 @@ class Viewer {
       u.uPixels.value = h;
       u.uRadius.value = 0.42 * drawing.spacing;
       drawing.rotation.set(...TURN[up]);
-      u.uMode.value = MODES[drawing.can[mode] ? mode : "plain"];
+      u.uMode.value = MODES[drawing.can[mode] ? mode : drawing.can.found ? "found" : "plain"];
       u.uMesh.value = drawing.isSurface ? 1 : 0;
       u.uColors.value = colors;
       for (const hidden of drawing.isSurface ? [gl.BACK, gl.FRONT] : [null]) { // where a fold has two faces at one depth, show the front
@@ -195,10 +201,11 @@ class Gallery {
   }
 
   open(views) {
+    const before = this.views;
     this.views = views;
     const pick = this.pick, first = views[0];
     for (const key of ["shape", "kind"]) if (!views.some((view) => view[key] === pick[key])) pick[key] = first[key];
-    return this.refresh();
+    return this.refresh().then(() => before.forEach((view) => this.viewer.forget(view)));
   }
 
   buttons(id, values, key, names = {}) {
@@ -231,13 +238,13 @@ class Gallery {
     this.buttons("#kinds", unique("kind"), "kind");
     this.buttons("#items", items.filter(drawing).map((item) => item.name), "item");
     this.buttons("#forms", forms, "form");
-    this.buttons("#modes", modes, "mode", { errors: view.error });
+    this.buttons("#modes", modes, "mode", { errors: view.error, found: "what was found" });
     this.buttons("#ups", ["x", "y", "z"], "up");
     $("#ups").parentElement.hidden = false;
     for (const button of $("#items").children) button.setAttribute("aria-pressed", String(!pick.grid && pick.item === button.dataset.value));
     $("#grid").setAttribute("aria-pressed", String(pick.grid));
     const box = viewer.canvas.parentElement.getBoundingClientRect(), count = shown.length || 1;
-    const cell = (c) => Math.min(box.width / c, box.height / Math.ceil(count / c));
+    const cell = (c) => Math.min(box.width / c, box.height / Math.ceil(count / c)) * (count % c ? 0.8 : 1); // no empty places
     const columns = Array.from({ length: count }, (_, i) => i + 1).reduce((a, b) => (cell(b) > cell(a) ? b : a));
     $("#labels").style.gridTemplateColumns = `repeat(${columns}, 1fr)`;
     $("#labels").replaceChildren(...shown.map((item) => Object.assign(document.createElement("span"), { textContent: item.name })));

@@ -14,6 +14,20 @@ Step = Callable[[int, int], None]
 """step(done, total): the same, of one stage."""
 
 
+listeners: list[Progress] = []
+"""Told of the stages too, see `heard`."""
+
+
+@contextmanager
+def heard(by: Progress) -> Iterator[None]:
+    """`by` is told of all stages meanwhile; of what tells no progress, as of a single step."""
+    listeners.append(by)
+    try:
+        yield
+    finally:
+        listeners.remove(by)
+
+
 def silent(*step: object) -> None:
     """Shows nothing: a `Progress`, and a `Step`."""
 
@@ -51,6 +65,8 @@ def stages(quiet: bool) -> Iterator[Progress]:
     shown = bar(quiet=quiet)
 
     def progress(stage: str, done: int, total: int) -> None:
+        for listener in listeners:
+            listener(stage, done, total)
         known = total if total > 1 or done else None  # a single step has no middle to show
         if stage not in tasks:
             shown.start()
@@ -69,6 +85,8 @@ def busy(text: str, quiet: bool) -> Iterator[None]:
     """A sign of life with the seconds so far, on a terminal, for what tells no progress."""
     from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
 
+    for listener in listeners:
+        listener(text, 0, 1)
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with bar(*columns, quiet=quiet, transient=True, unseen=False) as shown:
         shown.add_task(text, total=None)

@@ -118,3 +118,12 @@ def test_the_browser_gets_the_page_from_this_machine(folder: Path, monkeypatch: 
     done = ran(view.main, folder, "scan.ply", "open=false", "port=0")
     assert re.search(r"^open:   http://127\.0\.0\.1:\d+/", done.stdout, re.M)
     assert stored(answers[0].decode(), "views")[0]["shape"] == "scan.ply"
+
+
+def test_files_of_awkward_names_stand_alone(folder: Path) -> None:
+    name = "a, [b] {'c'}.ply"
+    (folder / "scan.ply").rename(folder / name)
+    done = ran(view.main, folder, name, "page=view.html", "ball.obj")
+    assert (done.returncode, done.stderr) == (0, "")
+    (shown,) = stored((folder / "view.html").read_text(), "views")
+    assert [item["name"] for item in shown["items"]] == [name, "ball.obj"]
