@@ -1,5 +1,6 @@
 """Users of `pnu app`: each has a token, a folder, one scan and one job at a time; nobody sees another's."""
 
+import math
 import re
 import secrets
 import shutil
@@ -298,9 +299,11 @@ def checked_keys(wanted: Mapping[str, Any]) -> dict[str, Any]:
         else:
             try:
                 value = float(value)
+                if not math.isfinite(value):
+                    raise ValueError
             except (TypeError, ValueError):
                 raise ValueError(f"{name}={str(value)[:40]}: expected a number") from None
-            value = int(value) if value == int(value or 0) else value
+            value = int(value) if value.is_integer() else value
         if DEFAULTS.get(name) != value:
             keys[name] = value
     if "spacing" in keys:

@@ -1,6 +1,9 @@
 """`pnu app`: in a real browser, a scan dropped, looked at, made dense, downloaded; two users; a damaged file."""
 
 import contextlib
+import io
+import itertools
+import os
 import re
 import signal
 import subprocess
@@ -11,12 +14,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from pnu.data import shapes
 from pnu.geometry.mesh_sampling import sample_area
 from pnu.io import write_cloud
 from tests.chromium import Page, chromium, needs_browser
 
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 PHASE = "document.body.dataset.phase"
 DRAWN = "Number(document.querySelector('#canvas').dataset.drawn)"
 
@@ -150,3 +155,40 @@ def test_two_users_see_their_own(tmp_path: Path) -> None:
         pages[0].wait(f"{PHASE} === 'empty'")
         assert [path.name for path in folder.rglob("*.ply")] == ["two.ply"]
         assert pages[1].run(f"fetch('/s/{first}/state').then((answer) => answer.status)") == 404
+
+
+@needs_browser
+@pytest.mark.slow
+def test_pictures_of_the_page(tmp_path: Path) -> None:
+    """Six, which docs/app.md shows: PNU_WRITE=1 writes them there. None is blank, and no two are alike."""
+    write_scan(tmp_path / "mug.ply", 3000)
+    (tmp_path / "damaged.ply").write_bytes((tmp_path / "mug.ply").read_bytes()[:20000])
+    folder = DOCS / "app" if os.environ.get("PNU_WRITE") else tmp_path
+    taken: dict[str, np.ndarray] = {}
+
+    def take(name: str) -> None:
+        time.sleep(1)  # until what moves has come to rest
+        picture = Image.open(io.BytesIO(page.picture())).convert("RGB")
+        picture.save(folder / f"{name}.webp", quality=80, method=6)
+        taken[name] = np.asarray(picture.resize((64, 40)), float)
+
+    with served() as (address, _), chromium(tmp_path / "profile") as browser:
+        page = browser.page(address, 1360, 900)
+        page.wait("sessionStorage.getItem('token')")
+        take("drop")
+        opened(page, tmp_path / "mug.ply")
+        take("look")
+        page.run("document.querySelector('#go').click()")
+        page.wait(f"{PHASE} === 'working' && document.querySelector('#left').textContent.includes('left')")
+        take("working")
+        page.wait(f"{PHASE} === 'done'", 300)
+        take("result")
+        page.run("document.querySelector('#items [data-value=surface]').click()")
+        take("surface")
+        page.drop(tmp_path / "damaged.ply")
+        page.wait("!document.querySelector('#error').hidden")
+        take("error")
+    for name, picture in taken.items():
+        assert picture.std() > 2, name
+    differences = [np.abs(a - b).mean() for a, b in itertools.combinations(taken.values(), 2)]
+    assert min(differences) > 0.05
