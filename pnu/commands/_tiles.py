@@ -20,8 +20,9 @@ TILES = (
 )
 USUAL = "4GiB"
 UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
-PROGRAM = 0.8 * 2**30  # bytes of Python, torch, the kernels, a slice of a file and the coarse cloud
-POINT_IN, POINT_OUT = 900, 450  # bytes for each point of a tile, and for each made of it, at the peak
+# by `python -m bench.tiles --calibrate 20000 60000 180000`
+PROGRAM = 0.65 * 2**30  # bytes of Python, torch, the kernels, a slice of a file and the coarse cloud
+POINT_IN, POINT_OUT = 2200, 560  # bytes for each point of a tile and its margin, and for each made of it, at the peak
 MARGINS = 24  # spacings that a tile and its margins are wider than the tile
 FEWEST = 1000  # points of a tile
 Say = Callable[[str], None]
