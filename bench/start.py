@@ -21,7 +21,6 @@ from pnu.io import atomic_path, write_cloud
 
 LINE = re.compile(r"import time: +(\d+) \| +\d+ \| +([\w.]+)")
 WORK = {  # on a small cloud; what is not named here wants a mesh, a training or a window
-    "convert": ["input=cloud.ply", "output=out.xyz"],
     "normals": ["input=cloud.ply", "output=out.ply"],
     "picture": ["inputs=[cloud.ply]", "output=out.png"],
     "reconstruct": ["input=cloud.ply", "output=mesh.ply"],

@@ -23,7 +23,7 @@ def check_streamed(path: str | Path) -> None:
     if suffix not in STREAMED:
         raise ValueError(
             f"{path}: {suffix or 'a file without suffix'} is not read in slices, as memory= and tiles= want it; "
-            f"pnu convert makes one of {' '.join(sorted(STREAMED))} of it"
+            f"save it as one of {' '.join(sorted(STREAMED))}"
         )
     open_file(Path(path), "point cloud", STREAMED)
 

@@ -1,7 +1,12 @@
 """`pnu upsample` of clouds in tiles: within a memory, in jobs, and what it refuses."""
 
+import contextlib
+import os
 import shlex
+import signal
 import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -87,7 +92,7 @@ BAD = {
     "memory=4GiB run=apss": "run=apss: takes the cloud as a whole, without memory= and tiles=; surface takes tiles",
     "memory=4GiB output=a.xyz": "a.xyz: .xyz is not written in parts, as memory= and tiles= want it; take one of",
     "memory=4GiB input=no.las": "no.las: no such file; give the path of a point cloud",
-    "memory=4GiB input=no.xyz": "no.xyz: .xyz is not read in slices, as memory= and tiles= want it; pnu convert",
+    "memory=4GiB input=no.xyz": "no.xyz: .xyz is not read in slices, as memory= and tiles= want it; save it as one of",
     "tiles=some": "tiles=some: expected all, plan or the number of a tile",
     "-m tiles=all ratio=2,3": "tiles=all: makes the jobs of one run; give each key one value",
 }
@@ -111,3 +116,58 @@ def test_memory_sets_the_size_of_tiles() -> None:
     assert 3 * small > large > 2 * small
     assert _tiles.tile_size("4096MiB", 4) == large
     assert _tiles.tile_size("4GiB", 1) > large
+
+
+def small_memory() -> str:
+    """The smallest that is accepted: tiles of a thousand points."""
+    for size in range(500, 2000, 10):
+        with contextlib.suppress(ValueError):
+            _tiles.tile_size(f"{size}MiB", 1)
+            return f"memory={size}MiB"
+    raise AssertionError
+
+
+LAUNCHERS = {
+    "joblib": ("loky.backend.popen_loky", ["hydra.launcher.n_jobs=2"]),
+    "submitit_local": ("submitit.core._submit", []),
+    "ray": ("ray::", ["hydra.launcher.ray.init.num_cpus=2"]),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", LAUNCHERS)
+def test_a_worker_that_is_killed_changes_nothing(tmp_path: Path, launcher: str) -> None:
+    pytest.importorskip({"submitit_local": "submitit"}.get(launcher, launcher))
+    worker, options = LAUNCHERS[launcher]
+    xy = np.random.default_rng(0).uniform(0, 70, (5000, 2))
+    np.save(tmp_path / "cloud.npy", np.column_stack([xy, np.sin(xy[:, 0] / 9)]))
+    keys = [sys.executable, "-m", "pnu", "upsample", "input=cloud.npy", "ratio=1", "up=z", small_memory()]
+    subprocess.run([*keys, "output=whole.npy", "quiet=true"], cwd=tmp_path, check=True)
+    command = [*keys, "-m", "output=jobs.npy", "tiles=all", f"hydra/launcher={launcher}", *options]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as child:
+        assert child.stdout is not None
+        while child.poll() is None and not list(tmp_path.glob("jobs.npy.parts/tiles_*/share_*")):
+            time.sleep(0.05)
+        workers = [pid for pid in descendants(child.pid) if worker in command_line(pid)]
+        assert workers
+        os.kill(workers[-1], signal.SIGKILL)
+        said = child.stdout.read()
+    assert child.returncode == 0, said
+    np.testing.assert_array_equal(np.load(tmp_path / "jobs.npy"), np.load(tmp_path / "whole.npy"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cloud.npy", "jobs.npy", "whole.npy"]
+
+
+def descendants(pid: int) -> list[int]:
+    """The processes that a process has started, and those that they have."""
+    found = []
+    for path in Path(f"/proc/{pid}/task").glob("*/children"):
+        with contextlib.suppress(OSError):
+            for child in map(int, path.read_text().split()):
+                found += [child, *descendants(child)]
+    return found
+
+
+def command_line(pid: int) -> str:
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+    return ""

@@ -88,7 +88,7 @@ def test_columns_and_ranges_of_slices(tmp_path: Path) -> None:
 
 def test_what_is_not_read_or_written_in_parts_says_so(tmp_path: Path) -> None:
     (tmp_path / "a.xyz").write_text("1 2 3\n")
-    with pytest.raises(ValueError, match=r"a.xyz: .xyz is not read in slices, .* pnu convert makes one of .las .laz"):
+    with pytest.raises(ValueError, match=r"a.xyz: .xyz is not read in slices, .* save it as one of .las .laz"):
         check_streamed(tmp_path / "a.xyz")
     with pytest.raises(ValueError, match=r"b.xyz: .xyz is not written in parts, .* take one of .las .laz .npy .ply"):
         check_partwise(tmp_path / "b.xyz")
