@@ -2,6 +2,7 @@
 PYTHON ?= python3
 VENV   ?= .venv
 ARGS   ?=
+SYSTEM ?= yes
 ABLATION ?= normals
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
@@ -14,14 +15,14 @@ help:   ## list the targets
 	@echo 'ARGS="key=value ..." is passed on: make train ARGS="model=pnu_paper loss.w3=0.1"'
 
 $(STAMP): pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(0 if (3, 11) <= sys.version_info < (3, 14) else "pnu needs Python 3.11, 3.12 or 3.13, $(PYTHON) is " + sys.version.split()[0] + ": make PYTHON=python3.12 ...")'
+	@$(PYTHON) -c 'import sys; sys.exit(0 if (3, 11) <= sys.version_info < (3, 15) else "pnu needs Python 3.11 to 3.14, $(PYTHON) is " + sys.version.split()[0] + ": make PYTHON=python3.12 ...")'
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo 'Python lacks venv; on Debian: apt-get install python3-venv'; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
-	@$(BIN)/pnu doctor --install
+	@$(BIN)/pnu doctor --install $(if $(filter no,$(SYSTEM)),--no-system)
 	@touch $@
 
-setup: $(STAMP)   ## virtual environment in .venv, pinned packages, pnu itself, system libraries, compiled kernels
+setup: $(STAMP)   ## virtual environment in .venv, pinned packages, pnu itself, system libraries (SYSTEM=no: none), compiled kernels
 
 check: $(STAMP)   ## lint, format and types
 	$(BIN)/ruff check .

@@ -4,11 +4,18 @@ with needed("training"):
     import lightning
 """
 
+import importlib.util
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 # package -> the extra of pnu that brings it
 EXTRAS = {
+    **dict.fromkeys(("lightning", "torchmetrics", "h5py", "tensorboard"), "train"),
+    "matplotlib": "figures",
+    "open3d": "poisson",
+    **dict.fromkeys(("laspy", "lazrs"), "las"),
+    "pye57": "e57",
+    "optuna": "sweeps",
     **dict.fromkeys(("onnx", "onnxruntime", "onnxscript"), "onnx"),
 }
 
@@ -31,6 +38,18 @@ def needed(purpose: str) -> Iterator[None]:
         if isinstance(error, MissingExtra) or package not in EXTRAS:
             raise
         raise MissingExtra(missing(package, purpose), name=error.name) from None
+
+
+def require(package: str, purpose: str) -> None:
+    """As `needed`, for a package that another process will import.
+
+    Raises:
+        MissingExtra: the package is not there.
+    """
+    with needed(purpose):
+        found = importlib.util.find_spec(package)
+    if found is None:
+        raise MissingExtra(missing(package, purpose), name=package)
 
 
 def missing(package: str, purpose: str) -> str:

@@ -36,7 +36,16 @@ ROOMS = [
 HEAVY = {"torch", "lightning", "hydra", "open3d", "tensorboard", "torchmetrics", "scipy", "h5py", "trimesh", "numba"}
 
 
-WHOLE = {"docs", "examples", "extending", "layers", "nightly", "side_effects", "wheel"}  # tests of no room alone
+WHOLE = {
+    "docs",
+    "examples",
+    "extending",
+    "extras",
+    "layers",
+    "nightly",
+    "side_effects",
+    "wheel",
+}  # tests of no room alone
 
 
 def test_tests_mirror_the_rooms() -> None:

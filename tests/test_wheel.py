@@ -16,6 +16,7 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
+from pnu import weights
 from pnu.__main__ import verbs
 from pnu.data import shapes
 from pnu.geometry.mesh_sampling import sample_area
@@ -26,6 +27,7 @@ from tests.test_docs import SHORT, released_checkpoint
 ROOT = Path(__file__).resolve().parents[1]
 ALL_HELP = """
 import contextlib, importlib.metadata, io, pathlib, sys, pnu
+from pnu import weights
 from pnu.__main__ import verbs
 (found,) = importlib.metadata.distributions(name="pnu", path=[sys.argv[1]])
 (script,) = [entry for entry in found.entry_points if entry.group == "console_scripts"]
@@ -96,7 +98,9 @@ def test_the_wheel_holds_what_the_package_reads(wheel: Path) -> None:
     files = [path for path in (ROOT / "pnu").rglob("*") if path.is_file() and "__pycache__" not in path.parts]
     wanted |= {path.relative_to(ROOT).as_posix() for path in files}
     assert {"pnu/conf/train.yaml", "pnu/py.typed", "pnu/weights/surface.safetensors", "pnu/report/base.html"} <= wanted
-    assert wanted - packed == set()
+    rivals = {f"pnu/weights/{name}{ending}" for name in weights.RIVALS for ending in (".md", weights.SUFFIX)}
+    assert wanted - packed == rivals
+    assert wheel.stat().st_size < 9e6
     assert any(name.endswith("licenses/LICENSE") for name in packed)
     assert {name.split("/")[0].partition("-")[0] for name in packed} == {"pnu"}
 

@@ -4,6 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from pnu.extras import needed
+
 NEIGHBORS, DEVIATIONS = 16, 2.0  # of the outlier removal
 DEPTH, TRIMMED = 8, 0.03  # of the octree; share of the vertices with the fewest points
 
@@ -16,7 +18,8 @@ def open3d_chain(ratio: float, seed: int = 0) -> Callable[[np.ndarray, np.ndarra
     """
 
     def method(points: np.ndarray, normals: np.ndarray | None) -> np.ndarray:
-        import open3d
+        with needed("the chain of Open3D"):
+            import open3d
 
         cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
         cloud, rows = cloud.remove_statistical_outlier(NEIGHBORS, DEVIATIONS)

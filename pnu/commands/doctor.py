@@ -1,4 +1,4 @@
-"""Check this machine: open3d's system libraries, compiled kernels: `pnu doctor [--install | --require]`."""
+"""Check this machine, its libraries and compiled kernels: `pnu doctor [--install [--no-system] | --require]`."""
 
 import sys
 
@@ -19,7 +19,7 @@ def kernels_line(*, install: bool) -> str:
 
 def main() -> None:
     """`pnu doctor`."""
-    if not set(sys.argv[1:]) - {"--install", "--require"}:
+    if not set(sys.argv[1:]) - {"--install", "--require", "--no-system"}:
         print(kernels_line(install="--install" in sys.argv[1:]))
     system_libraries.main()
 

@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 from pnu.commands._entry import command
 from pnu.config.instantiate import PACKAGES, find_metric, instantiate
 from pnu.config.schema import Group, Groups, doc
+from pnu.extras import needed
 from pnu.runtime.provenance import machine
 
 
@@ -52,7 +53,8 @@ def train(cfg: Any) -> list[float] | None:
         print(f"{run}: {run.skip}")
         return objective(config, run)
     with run.recorded(config) as record:
-        import lightning.pytorch as pl  # seconds: only once the config is known to be good
+        with needed("training"):
+            import lightning.pytorch as pl  # seconds: only once the config is known to be good
         import torch
 
         from pnu import metrics, networks

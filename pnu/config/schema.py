@@ -28,6 +28,7 @@ from pnu.config.signature import (
     first_sentence,
     members_of,
 )
+from pnu.extras import EXTRAS, require
 
 PACKAGE = Path(__file__).resolve().parents[1]
 OWN = {  # keys of every group that are Hydra's
@@ -85,6 +86,8 @@ def class_arguments(group: str, target: str, allow: Sequence[str] = ()) -> dict[
         raise ValueError(f"{group}.{expected}; allow=[{target.partition('.')[0]}] lets a package of your own define it")
     found = arguments(target)
     if found is None:
+        if (package := target.partition(".")[0]) in EXTRAS:
+            require(package, f"{group}._target_={target}")
         raise ValueError(f"{group}.{expected}, found no such class" + (f" in {', '.join(allow)} either" * bool(allow)))
     return {name: argument._replace(words=words(group, target, argument)) for name, argument in found.items()}
 

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pnu.extras import needed
 from pnu.io import Mesh
 
 APART = 3.0  # between meshes of the unit sphere
@@ -26,7 +27,8 @@ class MeshScene:
         """Closest points of surfaces and their normals, (B, m, 3) each, for points (B, m, 3) of meshes `shape` (B,)."""
         if self.scene is None:
             self.scene = ray_casting_scene(self.meshes, self.places)
-        import open3d
+        with needed("data: training the surface model"):
+            import open3d
 
         places = self.places[shape.cpu().numpy()][:, None]
         query = (points.detach().cpu().double().numpy() + places).astype(np.float32)
@@ -42,10 +44,8 @@ class MeshScene:
 
 def ray_casting_scene(meshes: Sequence[Mesh], places: Iterable[np.ndarray]) -> Any:
     """A scene of Open3D with the meshes at their places (3,)."""
-    try:
+    with needed("data: training the surface model"):
         import open3d
-    except ImportError as error:
-        raise ValueError("data: training the surface model needs open3d; pip install open3d") from error
     scene = open3d.t.geometry.RaycastingScene()
     for mesh, place in zip(meshes, places, strict=True):
         scene.add_triangles(

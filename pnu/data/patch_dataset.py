@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
-import h5py
 import numpy as np
 import torch
 from torch import Tensor
@@ -13,9 +12,13 @@ from torch.utils.data import Dataset, Sampler
 
 from pnu.data.augment import Augmentation
 from pnu.data.patch_file import check_patch_file
+from pnu.extras import needed
 from pnu.geometry.neighbor_features import gather
 from pnu.geometry.sampling import nonuniform_points, poisson_disk_points, random_points
 from pnu.geometry.unit_sphere import unit_sphere_frame
+
+with needed("files of patches"):
+    import h5py
 
 DATASETS = ("poisson_4096", "montecarlo_1024", "edges")
 Downsampling = Literal["nonuniform", "random", "poisson", "given"]

@@ -12,16 +12,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import h5py
 import numpy as np
 from scipy.spatial import cKDTree
 
 from pnu.data.shapes import unit_mesh
+from pnu.extras import needed
 from pnu.geometry.mesh_sampling import sample_area
 from pnu.geometry.mesh_topology import open_edges
 from pnu.geometry.sampling import farthest_points_large
 from pnu.geometry.sharp_edges import sharp_edge_points
 from pnu.io import Mesh, atomic_path
+
+with needed("files of patches"):
+    import h5py
 
 PATCH_POINTS = 4096
 EDGE_POINTS = 256

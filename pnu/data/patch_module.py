@@ -9,15 +9,18 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import lightning.pytorch as pl
 from torch.utils.data import DataLoader, Dataset, Subset
 
 from pnu.data import shapes
 from pnu.data.augment import Augmentation, from_options
 from pnu.data.patch_dataset import Downsampling, EpochSampler, Options, PatchDataset, check_options, split_shapes
 from pnu.data.patch_file import check_patch_file, cut_patch_file, told_open
+from pnu.extras import needed
 from pnu.io import Mesh, meshes_of, read_mesh
 from pnu.runtime.progress import counted
+
+with needed("training"):
+    import lightning.pytorch as pl
 
 
 class EpochDataModule(pl.LightningDataModule):

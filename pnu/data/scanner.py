@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pnu.data.mesh_scene import ray_casting_scene
+from pnu.extras import needed
 from pnu.geometry.mesh_sampling import sample_area, sample_poisson_disk
 from pnu.io import Mesh
 
@@ -242,7 +243,8 @@ def _rays(sensor: np.ndarray, camera: DepthCamera) -> np.ndarray:
 
 def _cast(scene: Any, sensor: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Depth along unit rays (m,), infinite where nothing is hit, and unit normals there (m, 3)."""
-    import open3d
+    with needed("the simulated scanner"):
+        import open3d
 
     origin = np.broadcast_to(sensor, rays.shape)
     hits = scene.cast_rays(open3d.core.Tensor.from_numpy(np.hstack([origin, rays]).astype(np.float32)), nthreads=1)

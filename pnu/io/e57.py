@@ -1,6 +1,5 @@
 """Exchange format of laser scanners, all scans of a file in one place; needs pye57: pip install 'pnu[e57]'."""
 
-import importlib.util
 import io
 import subprocess
 import sys
@@ -8,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pnu.extras import require
 from pnu.io import e57_child
 
 SECONDS = 600
@@ -19,8 +19,7 @@ NAMES = {
 
 def read_e57(path: Path) -> dict[str, np.ndarray]:
     """Columns (n,): x y z float64 as the scans are placed, intensity, and red green blue, where all scans have them."""
-    if importlib.util.find_spec("pye57") is None:
-        raise ValueError(f"{path}: e57 needs pye57, which is not installed: pip install 'pnu[e57]'")
+    require("pye57", f"{path}: reading e57")
     command = [sys.executable, "-I", e57_child.__file__, str(path)]
     try:
         done = subprocess.run(command, capture_output=True, check=False, timeout=SECONDS)

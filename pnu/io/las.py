@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from pnu.extras import needed
 from pnu.io import las_child
 from pnu.io.fields import GEOGRAPHIC, XYZ, distinct_names
 
@@ -36,10 +37,8 @@ Content = tuple[np.ndarray, np.ndarray | None, dict[str, np.ndarray], tuple[str,
 
 
 def _laspy(path: Path) -> ModuleType:
-    try:
+    with needed(f"{path}: reading and writing las"):
         import laspy
-    except ImportError:
-        raise ValueError(f"{path}: las and laz need laspy, which is not installed: pip install 'pnu[las]'") from None
     module: ModuleType = laspy
     return module
 

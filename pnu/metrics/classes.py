@@ -9,11 +9,14 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torchmetrics import Metric
 
+from pnu.extras import needed
 from pnu.io import Mesh
 from pnu.metrics import declared, functional
 from pnu.metrics.functional import mean_compute, mean_update
+
+with needed("measuring"):
+    from torchmetrics import Metric
 
 
 class CloudMean(Metric):

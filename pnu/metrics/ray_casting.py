@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from pnu.extras import needed
 from pnu.io import Mesh
 
 
@@ -10,7 +11,8 @@ def closest_points(mesh: Mesh, queries: np.ndarray) -> tuple[np.ndarray, np.ndar
 
     The only difference beyond rounding: which face is named where several share the closest point. Needs open3d.
     """
-    import open3d
+    with needed("ray casting"):
+        import open3d
 
     tensor = open3d.core.Tensor.from_numpy
     scene = open3d.t.geometry.RaycastingScene()

@@ -59,6 +59,11 @@ def load(source: str | PathLike[str], allow: Sequence[str] = ()) -> nn.Module:
         return network.eval()
     folder = Path(source)
     if not folder.is_dir():
+        if str(source) in weights.RIVALS:
+            raise ValueError(
+                f"run={source}: these weights do not come with the package; take pnu/weights/{source}{weights.SUFFIX}"
+                f" from the repository and give run={source}{weights.SUFFIX}"
+            )
         raise ValueError(
             f"run={folder}: expected a run folder, such as outputs/<date>/<time>_<name>, or a name of shipped weights"
             f" ({', '.join(weights.shipped_names())}), found no folder"

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pnu.extras import require
 from pnu.geometry.mesh_sampling import closest_points, face_normals, signed_volume
 from pnu.geometry.mesh_topology import open_edges
 from pnu.geometry.normal_estimation import complete_normals
@@ -107,6 +108,7 @@ def octree_depth(points: np.ndarray, box: float = BOX) -> int:
 
 def run_child(points: Array, normals: Array, depth: int, timeout: float, box: float = BOX) -> dict[str, np.ndarray]:
     """The surface that a process of its own makes; `ValueError` where it crashes or takes too long."""
+    require("open3d", "reconstructing a surface")
     with tempfile.TemporaryDirectory(prefix="pnu-") as folder:
         source, target = Path(folder, "cloud.npz"), Path(folder, "mesh.npz")
         np.savez(source, points=points, normals=normals, depth=depth, box=box)
@@ -129,7 +131,7 @@ def failure(code: int, stderr: str, depth: int) -> str:
     last = (stderr.strip().splitlines() or [""])[-1]
     if code == poisson_process.CANNOT_IMPORT:
         missing = missing_packages()
-        cure = f"run as root: {install_line(missing)}" if missing else "install it: pip install open3d"
+        cure = f"run as root: {install_line(missing)}" if missing else "install it again"
         return f"open3d, which reconstructs surfaces, cannot be imported here ({last}); {cure}"
     try:
         reason = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"failed with code {code} ({last})"

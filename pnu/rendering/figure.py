@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from pnu.extras import needed
 from pnu.io import atomic_path
 from pnu.rendering.colors import value_colors
 
@@ -139,8 +140,9 @@ def typeface(size: float) -> ImageFont.FreeTypeFont:
 
 def draw_colorbar(bar: ColorBar, height: int, size: float) -> Picture:
     """The bar and its label, `height` pixels high, with numbers of `size` pixels; cut to what it needs."""
-    from matplotlib import style
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    with needed("drawing plots"):
+        from matplotlib import style
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     with style.context("default"):
         canvas = FigureCanvasAgg(colorbar_figure(bar, height, size))
@@ -151,10 +153,11 @@ def draw_colorbar(bar: ColorBar, height: int, size: float) -> Picture:
 
 def colorbar_figure(bar: ColorBar, height: int, size: float) -> "Figure":
     """The bar as matplotlib draws it, in the middle of a white strip."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import ListedColormap, Normalize
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import MaxNLocator
+    with needed("drawing plots"):
+        from matplotlib.cm import ScalarMappable
+        from matplotlib.colors import ListedColormap, Normalize
+        from matplotlib.figure import Figure
+        from matplotlib.ticker import MaxNLocator
 
     pixels, length, points = 8 * size, min(0.8 * height, 24 * size), 0.85 * size * 72 / DPI
     figure = Figure(figsize=(pixels / DPI, height / DPI), dpi=DPI)

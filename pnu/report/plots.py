@@ -9,6 +9,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
+from pnu.extras import needed
 from pnu.report.sweep_results import Setting, Study, effects, short
 
 if TYPE_CHECKING:
@@ -83,10 +84,11 @@ def plots(study: Study) -> dict[str, Plot]:
 
 def plot(caption: str, drawn: Sequence[Panel], legend: Sequence[str] = (), columns: int = 3) -> Plot:
     """Panels in rows, and below them a legend: number and color of each name."""
-    from matplotlib import style
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
+    with needed("drawing plots"):
+        from matplotlib import style
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+        from matplotlib.lines import Line2D
 
     columns = min(columns, len(drawn))
     rows, across = -(-len(drawn) // columns), max(1, round(columns * WIDTH / 2.6))
@@ -136,7 +138,8 @@ def dash(index: int) -> Literal["-", "--"]:
 def logarithmic(axis: "Axis", values: Iterable[float]) -> None:
     """Make an axis logarithmic, with round numbers that the axis holds: at powers of ten, 1 2 5, or, where all values
     lie within less than a decade, as on a linear one."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+    with needed("drawing plots"):
+        from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
     known = [value for value in values if math.isfinite(value) and value > 0] or [1.0, 10.0]
     low, high = min(known), max(known)
@@ -233,7 +236,8 @@ def curve_panel(study: Study, name: str) -> Panel | None:
 
 def mean_curve(setting: Setting, name: str, points: int = 200) -> Curve:
     """The mean over seeds of a logged value at each step that all have; training values as means over 20 steps."""
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+    with needed("TensorBoard"):
+        from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     logging.getLogger("tensorboard").setLevel(logging.ERROR)  # it warns of runs that went on after an interruption
     by_step: defaultdict[float, list[float]] = defaultdict(list)

@@ -2,7 +2,8 @@
 
 Only open3d's own functions (Poisson reconstruction) and TensorBoard beside an installed open3d need them; training,
 data preparation, upsampling and evaluation do not. `--install` installs what is missing where this is Debian and the
-user is root, and prints the line to run otherwise; `--require` ends with exit code 1 where open3d cannot be imported.
+user is root, and prints the line to run otherwise, also with `--no-system`; `--require` ends with exit code 1 where
+open3d cannot be imported.
 """
 
 import ctypes
@@ -35,8 +36,9 @@ def install_line(packages: list[str]) -> str:
 
 def install(packages: list[str]) -> bool:
     """Install Debian packages as root. False where that is not possible or failed."""
-    if os.geteuid() != 0 or shutil.which("apt-get") is None:
+    if getattr(os, "geteuid", lambda: 1)() != 0 or shutil.which("apt-get") is None:
         return False
+    print(f"installing system libraries that open3d needs: {install_line(packages)}", flush=True)
     environment = os.environ | {"DEBIAN_FRONTEND": "noninteractive"}
     for command in (["apt-get", "update", "-qq"], ["apt-get", "install", "-qq", "--no-install-recommends", *packages]):
         if subprocess.run(command, env=environment, stdout=subprocess.DEVNULL, check=False).returncode:
@@ -53,10 +55,10 @@ def open3d_error() -> str | None:
 def main() -> None:
     """`pnu doctor`."""
     arguments = sys.argv[1:]
-    if set(arguments) - {"--install", "--require"}:
+    if set(arguments) - {"--install", "--require", "--no-system"}:
         sys.exit(__doc__)
     missing = missing_packages()
-    if missing and "--install" in arguments and install(missing):
+    if missing and "--install" in arguments and "--no-system" not in arguments and install(missing):
         missing = missing_packages()
     if missing:
         print(f"open3d needs system libraries that are missing here; run as root:\n  {install_line(missing)}")

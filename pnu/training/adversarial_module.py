@@ -5,11 +5,14 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 
+from pnu.extras import needed
 from pnu.losses import AdversarialLoss
 from pnu.training.lightning_module import Batch, UpsamplingModule
+
+with needed("training"):
+    from lightning.pytorch.utilities.types import OptimizerLRScheduler
 
 
 class AdversarialModule(UpsamplingModule):

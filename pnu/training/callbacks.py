@@ -9,23 +9,26 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-import lightning.pytorch as pl
 import numpy as np
 import torch
-from lightning.pytorch.loggers import Logger, TensorBoardLogger
-from lightning.pytorch.plugins.io import TorchCheckpointIO
 from omegaconf import OmegaConf
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch import Tensor
-from torch.utils.tensorboard.summary import hparams
 
 from pnu.config.instantiate import PACKAGES, find_class, instantiate
 from pnu.config.signature import arguments
+from pnu.extras import needed
 from pnu.networks.checkpoints import read_checkpoint, write_checkpoint
 from pnu.rendering import figure, look_at, render_cloud, save_png
 from pnu.rendering.colors import normal_colors
 from pnu.runtime.progress import bar
 from pnu.training.run_folder import UNHASHED, UNHASHED_DATA, RunFolder
+
+with needed("training"):
+    import lightning.pytorch as pl
+    from lightning.pytorch.loggers import Logger, TensorBoardLogger
+    from lightning.pytorch.plugins.io import TorchCheckpointIO
+    from torch.utils.tensorboard.summary import hparams
 
 CLOUDS_3D = 4  # shapes in TensorBoard's 3D tab
 

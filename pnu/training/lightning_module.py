@@ -11,18 +11,21 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import lightning.pytorch as pl
 import torch
-from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.plugins.layer_sync import TorchSyncBatchNorm
-from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 
+from pnu.extras import needed
 from pnu.fast import accelerate
 from pnu.metrics import METRICS, CloudMetrics, Metric
 from pnu.networks.checkpoints import write_checkpoint
 from pnu.networks.norm import synchronize
 from pnu.upsamplers import dense_patches
+
+with needed("training"):
+    import lightning.pytorch as pl
+    from lightning.fabric.utilities.exceptions import MisconfigurationException
+    from lightning.pytorch.plugins.layer_sync import TorchSyncBatchNorm
+    from lightning.pytorch.utilities.types import OptimizerLRScheduler
 
 Batch = Mapping[str, Any]
 

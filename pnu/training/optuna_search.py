@@ -4,6 +4,8 @@ import logging
 import warnings
 from typing import Any
 
+from pnu.extras import needed
+
 
 def search_arguments(hydra: Any) -> list[str]:
     """What the command line of a sweep gets added so that a search started again goes on.
@@ -19,8 +21,9 @@ def search_arguments(hydra: Any) -> list[str]:
     storage = sweeper.get("storage")
     if "Optuna" not in str(sweeper.get("_target_")) or not storage:
         return []
-    import optuna
-    from optuna.trial import TrialState
+    with needed("hydra/sweeper=optuna"):
+        import optuna
+        from optuna.trial import TrialState
 
     optuna.logging.set_verbosity(logging.WARNING)
     if sweeper.study_name not in {summary.study_name for summary in optuna.get_all_study_summaries(storage)}:

@@ -132,8 +132,10 @@ def label_of(overrides: str) -> str:
 
 def locked(path: Path) -> int:
     """A lock on a folder that the system takes back when the process ends, however it ends."""
-    import fcntl  # not on Windows
-
+    try:
+        import fcntl
+    except ImportError:
+        return _locked_file(path)
     descriptor = os.open(path, os.O_RDONLY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -142,6 +144,19 @@ def locked(path: Path) -> int:
         raise ValueError(f"{path}: another process runs this job; wait for it") from None
     except OSError:  # a file system without locks
         pass
+    return descriptor
+
+
+def _locked_file(path: Path) -> int:
+    """`locked`, by a file in the folder, where folders cannot be locked: Windows."""
+    import msvcrt
+
+    descriptor = os.open(path / ".lock", os.O_RDWR | os.O_CREAT)
+    try:
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined,unused-ignore]
+    except OSError:
+        os.close(descriptor)
+        raise ValueError(f"{path}: another process runs this job; wait for it") from None
     return descriptor
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 FOLDER = Path(__file__).parent
 SUFFIX = ".safetensors"
+RIVALS = ("ecnet", "pugeo", "punet")  # in the repository alone: 8 MB that no wheel carries
 
 
 class Weights(NamedTuple):

@@ -96,7 +96,7 @@ def test_lidar_files_in_slices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     np.testing.assert_allclose(foreign.xyz, points, atol=1e-8)
     np.testing.assert_array_equal(foreign.classification, attributes["classification"])
     monkeypatch.setitem(sys.modules, "laspy", None)
-    with pytest.raises(ValueError, match=r"laspy, which is not installed: pip install 'pnu\[las\]'"):
+    with pytest.raises(ValueError, match=r'laspy, which is not installed: pip install "pnu\[las\]"'):
         read_cloud(path)
 
 

@@ -105,7 +105,9 @@ def test_e57(tmp_path: Path) -> None:
 def test_e57_without_its_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "c.e57").write_bytes(b"x")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ValueError, match=r"c\.e57: e57 needs pye57, which is not installed: pip install 'pnu\[e57\]'"):
+    with pytest.raises(
+        ValueError, match=r'c\.e57: reading e57 needs pye57, which is not installed: pip install "pnu\[e57\]"'
+    ):
         read_cloud(tmp_path / "c.e57")
 
 

@@ -1,0 +1,200 @@
+"""What not every use needs: extras that name themselves, systems without POSIX, a container."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+
+import pnu
+from pnu import weights
+from pnu.benchmark import cost
+from pnu.extras import EXTRAS, MissingExtra, needed, require
+from pnu.kernels import compilation
+from pnu.runtime import system_libraries
+from pnu.training import sweeps
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+ALONE = {"las_child.py", "e57_child.py", "poisson_process.py"}  # processes of their own
+
+
+def top(module: str) -> str:
+    return "tensorboard" if module.startswith("torch.utils.tensorboard") else module.split(".")[0]
+
+
+def bare_imports(path: Path) -> Iterator[str]:
+    """Imports of what belongs to an extra that stand outside of `with needed(...)`."""
+    tree = ast.parse(path.read_text())
+    guarded = set()
+    for node in ast.walk(tree):
+        named = isinstance(node, ast.With) and ast.unparse(node.items[0]).startswith("needed(")
+        typed = isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        if named or typed:
+            guarded |= {*ast.walk(node)}
+    for node in ast.walk(tree):
+        if node not in guarded and isinstance(node, ast.Import | ast.ImportFrom):
+            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else [alias.name for alias in node.names]
+            yield from (name for name in names if top(name) in EXTRAS)
+
+
+def test_every_optional_import_names_its_extra(tmp_path: Path) -> None:
+    found = {path.name: [*bare_imports(path)] for path in (ROOT / "pnu").rglob("*.py") if path.name not in ALONE}
+    assert {name: bare for name, bare in found.items() if bare} == {}
+    (tmp_path / "a.py").write_text("import h5py\nwith needed('x'):\n    import laspy\nfrom matplotlib import style\n")
+    assert [*bare_imports(tmp_path / "a.py")] == ["h5py", "matplotlib"]
+
+
+def test_extras_bring_what_they_are_said_to_bring() -> None:
+    extras = {
+        name: {Requirement(line).name for line in lines} for name, lines in PROJECT["optional-dependencies"].items()
+    }
+    base = {Requirement(line).name for line in PROJECT["dependencies"]}
+    package = {"optuna": "hydra-optuna-sweeper", "lazrs": "laspy"}
+    for module, extra in EXTRAS.items():
+        assert package.get(module, module) in extras[extra], module
+        assert package.get(module, module) not in base, module
+    developed = next(line for line in PROJECT["optional-dependencies"]["dev"] if line.startswith("pnu["))
+    assert Requirement(developed).extras >= {*EXTRAS.values()}  # what `make` installs
+
+
+def test_what_is_missing_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    line = r'^cutting patches needs h5py, which is not installed: pip install "pnu\[train\]"$'
+    with pytest.raises(MissingExtra, match=line), needed("cutting patches"):
+        import h5py  # noqa: F401
+    with pytest.raises(ModuleNotFoundError, match="^No module named 'nothing_of_that_name'$"), needed("x"):
+        import nothing_of_that_name  # noqa: F401
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    with pytest.raises(ValueError, match=r'^x needs open3d, .*: pip install "pnu\[poisson\]"$'):
+        require("open3d", "x")
+
+
+BASE = """
+import sys
+from pnu.extras import EXTRAS
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in EXTRAS:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Absent())
+import numpy, pnu
+from pnu.__main__ import main
+points = numpy.random.default_rng(0).normal(size=(200, 3))
+points /= numpy.linalg.norm(points, axis=1, keepdims=True)
+numpy.savetxt("a.xyz", points)
+for arguments in (
+    ["upsample", "input=a.xyz", "output=dense.ply", "quiet=true"],
+    ["normals", "input=a.xyz", "output=normals.ply", "quiet=true"],
+    ["picture", "inputs=[a.xyz]", "output=a.png", "quiet=true"],
+    ["train", "quiet=true"], ["prepare", "quiet=true"],
+    ["reconstruct", "input=dense.ply", "output=mesh.ply"],
+):
+    try:
+        main(arguments)
+        print(arguments[0], "done")
+    except SystemExit as stop:
+        print(arguments[0], stop.code)
+"""
+
+
+@pytest.mark.slow
+def test_the_base_alone_densifies_and_names_what_is_missing(tmp_path: Path) -> None:
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "200"}
+    done = subprocess.run([sys.executable, "-c", BASE], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    last = [line for line in done.stdout.splitlines() if re.fullmatch(r"\w+ (done|2)", line)]
+    expected = ["upsample done", "normals done", "picture done", "train 2", "prepare 2", "reconstruct 2"]
+    assert last == expected, done.stdout + done.stderr
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    extras = re.findall(r'pip install "pnu\[(\w+)\]"', "\n".join(errors))
+    assert extras == ["train", "train", "poisson"], errors
+
+
+def test_weights_that_no_wheel_carries_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(weights, "FOLDER", tmp_path)
+    with pytest.raises(ValueError, match=r"^run=punet: .* take pnu/weights/punet\.safetensors from the repository and"):
+        pnu.load("punet")
+    assert {path.stem for path in (ROOT / "pnu" / "weights").glob("*.safetensors")} >= {*weights.RIVALS}
+
+
+POSIX = re.compile(
+    r"\b(import (?:fcntl|resource|pwd|grp|termios|tty|pty|posix)\b|os\.(?:fork|kill|killpg|nice|getuid|geteuid|setsid"
+    r"|mkfifo|sched_getaffinity|uname|statvfs|getpgid|chown|wait\w*)\b|signal\.(?:SIGKILL|SIGHUP|SIGALRM|SIGUSR\d|SIGQUIT|alarm))"
+)
+KNOWN = {  # each with a fallback, which a test here runs, or a test of its own
+    ("training/sweeps.py", "import fcntl"): "_locked_file",
+    ("kernels/compilation.py", "import fcntl"): "ImportError",
+    ("kernels/compilation.py", "os.nice"): "AttributeError",
+    ("benchmark/cost.py", "import resource"): "ImportError",
+    ("data/patch_module.py", "os.sched_getaffinity"): "hasattr",
+    ("io/las_child.py", "import resource"): "ImportError",
+    ("io/e57_child.py", "import resource"): "ImportError",
+    **dict.fromkeys((("app/jobs.py", "os.killpg"), ("app/jobs.py", "signal.SIGKILL")), 'hasattr(os, "killpg")'),
+    **dict.fromkeys(
+        (("commands/_worker.py", "os.killpg"), ("commands/_worker.py", "signal.SIGKILL")), 'hasattr(os, "killpg")'
+    ),
+}
+
+
+def test_calls_that_only_posix_has_have_a_fallback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = {
+        (path.relative_to(ROOT / "pnu").as_posix(), call)
+        for path in (ROOT / "pnu").rglob("*.py")
+        for call in POSIX.findall(path.read_text())
+    }
+    assert found == KNOWN.keys()
+    assert all(fallback in (ROOT / "pnu" / place).read_text() for (place, _), fallback in KNOWN.items())
+
+    taken: list[int] = []
+
+    def locking(descriptor: int, _mode: int, _count: int) -> None:
+        if taken:
+            raise OSError("taken")
+        taken.append(descriptor)
+
+    monkeypatch.setitem(sys.modules, "fcntl", None)
+    monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(locking=locking, LK_NBLCK=2))
+    os.close(sweeps.locked(tmp_path))
+    with pytest.raises(ValueError, match="another process runs this job"):
+        sweeps.locked(tmp_path)
+    assert compilation._taken(None, wait=False)
+    monkeypatch.setattr(cost, "resource", None)
+    assert len(cost.children()) == 2
+    monkeypatch.delattr(os, "geteuid")
+    assert not system_libraries.install(["libgl1"])
+
+
+def test_the_steps_of_the_container() -> None:
+    """What is copied is there and is what the wheel is made of; libraries and extras are those of the project."""
+    text = (ROOT / "Dockerfile").read_text()
+    (python,) = re.findall(r"^FROM python:(3\.\d+)-", text, re.M)
+    assert python in SpecifierSet(PROJECT["requires-python"])
+    copied = [word for line in re.findall(r"^COPY (.*) \S+$", text, re.M) for word in line.split()]
+    assert copied == ["pyproject.toml", "README.md", "LICENSE", "conf", "pnu"]
+    assert all((ROOT / name).exists() for name in copied)
+    kept = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
+    assert kept == {*copied}
+    assert set(system_libraries.LIBRARIES.values()) <= set(text.split())
+    (extras,) = re.findall(r'"\.\[(.*)\]"', text)
+    assert set(extras.split(",")) <= PROJECT["optional-dependencies"].keys()
+    torch = next(line for line in PROJECT["dependencies"] if line.startswith("torch"))
+    assert f'"{torch}"' in text
+    assert text.rstrip().endswith('ENTRYPOINT ["pnu"]')
+    assert "doctor --install --no-system" in text
+
+
+def test_make_leaves_the_system_alone_if_asked() -> None:
+    def steps(*given: str) -> str:
+        command = ["make", "--dry-run", "--always-make", "setup", f"PYTHON={sys.executable}", *given]
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+
+    assert "doctor --install --no-system" in steps("SYSTEM=no")
+    assert "--no-system" not in steps()
