@@ -1,7 +1,7 @@
 """The README's picture: `python -m bench.turning [OUTPUT.webp] [--shape horse] [--frames 36]`.
 
-A simulated photogrammetric scan of a procedural shape, 3 % of its points stray; what `pnu scan` makes of it; a whole turn
-of all three by `pnu picture`.
+A simulated photogrammetric scan of a procedural shape, 3 % of its points stray; what `pnu scan` makes of it; a turn of
+all three by `pnu picture`.
 """
 
 import argparse

@@ -91,7 +91,7 @@ def picture(cfg: Any) -> None:
     apart = cfg.fit is None and not rendering.in_one_place(*points)
     side = {"azimuth": cfg.azimuth, "elevation": cfg.elevation, "up": cfg.up}
     one = points if cfg.fit == 0 else [points[(cfg.fit or 1) - 1]]
-    views = [views_of(own, cfg.frames, side) for own in ([[p] for p in points] if apart else [one])]
+    views = [cameras_of(own, cfg.frames, side) for own in ([[p] for p in points] if apart else [one])]
     names = [Path(path).stem for path in inputs] if captions is None else list(captions)
     pictures = []
     with stages(cfg.quiet or cfg.frames == 1) as progress:
@@ -121,7 +121,7 @@ def picture(cfg: Any) -> None:
         print(f"output: {cfg.output}, {turn}{width} x {height} pixels, {time.perf_counter() - started:.1f} s")
 
 
-def views_of(points: Sequence["NDArray[np.float64]"], frames: int, side: dict[str, Any]) -> list["Camera"]:
+def cameras_of(points: Sequence["NDArray[np.float64]"], frames: int, side: dict[str, Any]) -> list["Camera"]:
     """The cameras that see all points, one a frame."""
     from pnu import rendering
 

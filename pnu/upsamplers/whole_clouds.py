@@ -197,7 +197,7 @@ def upsample(
     if devices > 1 and not getattr(upsampler, "parallel", False):
         raise ValueError(f"devices={devices}: {type(network).__name__} works in one process; leave devices=1")
     names = _names(target, devices)
-    sparse, frame = _prepare(given, progress)
+    sparse, frame = _prepare(given, progress, refine=not getattr(network, "passes", 0))
     if not getattr(upsampler, "follows", False) and (density == "follow" or keep is True):
         asked = "density=follow" if density == "follow" else "keep=true"
         raise ValueError(
@@ -521,16 +521,23 @@ def _digest(network: Any, sparse: Tensor, count: int, upsampler: object, *option
     return digest.hexdigest()[:16]
 
 
-def _prepare(cloud: Cloud, progress: Progress) -> tuple[Tensor, Frame]:
-    """The points in a fixed order with normals, (n, 6) float64 in the unit sphere, and the way back."""
+def _prepare(cloud: Cloud, progress: Progress, *, refine: bool = False) -> tuple[Tensor, Frame]:
+    """The points in a fixed order with normals, (n, 6) float64 in the unit sphere, and the way back.
+
+    refine: normals that are missing are found by the surface model, not left to a network that does so itself.
+    """
     order = np.lexsort(cloud.points.T)
     unit, frame = _unit_sphere(cloud.points[order])
     given = None if cloud.normals is None else torch.from_numpy(cloud.normals[order])
-    if given is None or given.isnan().any():
+    missing = torch.ones(len(order), dtype=torch.bool) if given is None else given.isnan().any(1)
+    if missing.any():
         progress("normals", 0, 1)
         directions = complete_normals(unit[0], given)
+        if refine:
+            directions = torch.where(missing[:, None], learned_normals(unit[0], directions, progress), directions)
         progress("normals", 1, 1)
     else:
+        assert given is not None
         directions = given
     return torch.cat([unit[0], directions], 1), frame
 
