@@ -38,7 +38,8 @@ DOUBTFUL = 16  # looked for among so many for each point to drop
 ROOM = 0.7  # around a point that is kept, in spacings that evenly spread points would have
 LONG = 10_000  # points made from which on a computation takes long enough to have kernels compiled beside it
 SPACED = 6  # neighbors whose mean distance is the spacing at a point of the cloud,
-COVERED = 0.5  # of which so much may lie between it and the nearest point made
+COVERED = 0.5  # of which so much may lie between it and the nearest point made;
+NEARER, APPROACHES = 0.9, 3  # that comes to this share of it, again where another lost its own
 CLOSE = 12  # neighbors of the sphere that candidates are first moved to
 
 
@@ -117,17 +118,16 @@ class SurfaceProjection:
     def covering(self, query: Tensor, kept: Tensor, cloud: Tensor, first: int, context: Context) -> Tensor:
         """Points (m, 6) of which one lies within half a spacing of each of the first points of a cloud (n, 6).
 
-        Where neither they nor those that are kept do, the cloud's own point comes, projected, and one that stands
-        close to others and covers nothing alone goes.
+        Where neither they nor those that are kept do, the nearest of them comes so near.
         """
-        bare = uncovered(cloud[:first, :3], torch.cat([query[:, :3], kept[:, :3]]))
-        spare = dispensable(query[:, :3], cloud[:first, :3])[: len(bare)]
-        if not len(spare):
-            return query
-        added, _ = self.projected(cloud[bare[: len(spare)]], cloud, context, "places without points")
-        stays = torch.ones(len(query), dtype=torch.bool, device=query.device)
-        stays[spare] = False
-        return torch.cat([query[stays], added])
+        for number in range(1, APPROACHES + 1):
+            rows, places = approached(query[:, :3], kept[:, :3], cloud[:first, :3])
+            if not len(rows):
+                break
+            moved = torch.cat([places, query[rows, 3:]], 1)
+            query = query.clone()
+            query[rows], _ = self.projected(moved, cloud, context, f"places without points, {number}")
+        return query
 
     def projected(self, query: Tensor, cloud: Tensor, context: Context, stage: str) -> tuple[Tensor, Tensor]:
         """Queries (m, 6) on the surface of a cloud (n, 6), and the logarithm of their expected error (m,)."""
@@ -288,26 +288,24 @@ def reject_worst(points: Tensor, error: Tensor, count: int) -> Tensor:
     return stays.nonzero()[:, 0]
 
 
-def uncovered(points: Tensor, cloud: Tensor) -> Tensor:
-    """Rows (k,) of points (n, 3) without one of a cloud (m, 3) within half of their spacing, the barest first."""
-    near = knn(points[None], points[None], min(SPACED + 1, len(points))).dist_sq[0, :, 1:]
-    share = nearest(points[None], cloud[None]).dist_sq[0].sqrt() / near.sqrt().mean(1).clamp_min(1e-300)
-    order = share.argsort(descending=True, stable=True)
-    return order[: int((share > COVERED).sum())]
+def approached(cloud: Tensor, kept: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows (k,) of a cloud (m, 3) to be moved, and where to (k, 3), for points (n, 3) that have none of it near.
 
-
-def dispensable(cloud: Tensor, points: Tensor) -> Tensor:
-    """Rows (k,) of a cloud (m, 3) that are nearest to none of the points (n, 3), the most crowded first.
-
-    Of two that are each other's nearest one alone.
+    Near is half of the spacing of the points; none of those that are kept (l, 3) lies there either. Each row moves once,
+    for the barest point.
     """
-    found = knn(cloud[None], cloud[None], 2)
-    other, apart = found.idx[0, :, 1], found.dist_sq[0, :, 1]
-    rows = torch.arange(len(cloud), device=cloud.device)
-    spare = torch.ones_like(rows, dtype=torch.bool)
-    spare[nearest(points[None], cloud[None]).idx[0]] = False
-    spare &= ~((other[other] == rows) & (other < rows) & spare[other])
-    return rows[spare][apart[spare].argsort(stable=True)]
+    around = knn(points[None], points[None], min(SPACED + 1, len(points))).dist_sq[0, :, 1:]
+    reach = COVERED * around.sqrt().mean(1)
+    found = nearest(points[None], torch.cat([cloud, kept])[None])
+    apart, row = found.dist_sq[0].sqrt(), found.idx[0]
+    share = apart / reach.clamp_min(1e-300)
+    bare = share.argsort(descending=True, stable=True)[: int((share > 1).sum())]
+    bare = bare[row[bare] < len(cloud)]  # what is kept does not move
+    _, barest = np.unique(row[bare].cpu().numpy(), return_index=True)
+    bare = bare[torch.from_numpy(np.sort(barest)).to(bare.device)]
+    to_point = points[bare] - cloud[row[bare]]
+    step = (apart[bare] - NEARER * reach[bare]) / apart[bare].clamp_min(1e-300)
+    return row[bare], cloud[row[bare]] + step[:, None] * to_point
 
 
 def even_out(cloud: Tensor, steps: int, step: Step = silent, kept: Tensor | None = None) -> Tensor:
