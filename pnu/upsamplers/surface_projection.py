@@ -291,8 +291,8 @@ def reject_worst(points: Tensor, error: Tensor, count: int) -> Tensor:
 def approached(cloud: Tensor, kept: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     """Rows (k,) of a cloud (m, 3) to be moved, and where to (k, 3), for points (n, 3) that have none of it near.
 
-    Near is half of the spacing of the points; none of those that are kept (l, 3) lies there either. Each row moves once,
-    for the barest point.
+    Near is half of the spacing of the points; none of those that are kept (l, 3) lies there either. Each row moves
+    once, for the barest point.
     """
     around = knn(points[None], points[None], min(SPACED + 1, len(points))).dist_sq[0, :, 1:]
     reach = COVERED * around.sqrt().mean(1)
