@@ -112,16 +112,18 @@ class SurfaceProjection:
             query = named("even spacing", lambda step: even_out(query, network.relaxation, step, kept))
         for i in range(network.refinements):
             query, error = self.projected(query, cloud, context, f"refinement {i + 1}")
-        query = self.covering(query[reject_worst(query[:, :3], error, new)], kept, cloud, first, context)
+        query = query[reject_worst(query[:, :3], error, new)]
+        if first == len(cloud):  # of a part others make what lies at its borders
+            query = self.covering(query, kept, cloud, context)
         return torch.cat([self.with_normals(kept, cloud, context), query]) if len(kept) else query
 
-    def covering(self, query: Tensor, kept: Tensor, cloud: Tensor, first: int, context: Context) -> Tensor:
-        """Points (m, 6) of which one lies within half a spacing of each of the first points of a cloud (n, 6).
+    def covering(self, query: Tensor, kept: Tensor, cloud: Tensor, context: Context) -> Tensor:
+        """Points (m, 6) of which one lies within half a spacing of each point of a cloud (n, 6).
 
         Where neither they nor those that are kept do, the nearest of them comes so near.
         """
         for number in range(1, APPROACHES + 1):
-            rows, places = approached(query[:, :3], kept[:, :3], cloud[:first, :3])
+            rows, places = approached(query[:, :3], kept[:, :3], cloud[:, :3])
             if not len(rows):
                 break
             moved = torch.cat([places, query[rows, 3:]], 1)

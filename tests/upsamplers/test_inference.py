@@ -250,7 +250,8 @@ def test_progress_reaches_the_end_of_each_stage() -> None:
         model=Spread(),
         progress=lambda s, done, total: calls.setdefault(s, []).append((done, total)),
     )
-    assert len(calls) == 5  # normals, and network and farthest points in each of two passes
+    # normals and two passes of the surface model for them; network and farthest points in each of two passes
+    assert len(calls) == 7
     for steps in calls.values():
         done = [step[0] for step in steps]
         assert done == sorted(done)

@@ -85,9 +85,10 @@ def test_borders_have_the_spacing_of_the_inside(tmp_path: Path) -> None:
     np.testing.assert_allclose(border.mean(), inside.mean(), rtol=0.03)
     np.testing.assert_allclose(border[:, 0].mean(), inside[:, 0].mean(), rtol=0.05)
     np.testing.assert_allclose(border[:, 0].std(), inside[:, 0].std(), rtol=0.2)
-    made = np.concatenate([np.load(plan.path("made", i)) for i in plan.tiles])  # what it was before: points that meet
-    assert border[:, 0].min() > 2 * cKDTree(made[:, :3]).query(made[:, :3], k=2)[0][:, 1].min()
-    np.testing.assert_allclose(len(made), 4800, rtol=0.03)  # so that few are left over
+    low, usual = (np.quantile(spaces[:, 0], 0.01) for spaces in (border, inside))
+    assert low > 0.7 * usual
+    made = sum(len(np.load(plan.path("made", i))) for i in plan.tiles)
+    np.testing.assert_allclose(made, 4800, rtol=0.03)  # so that few are left over
 
 
 def test_sides_agree_between_tiles(tmp_path: Path) -> None:
