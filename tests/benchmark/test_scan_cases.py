@@ -43,6 +43,7 @@ def test_scores_of_scans_by_hand() -> None:
     assert float(Gap()(pair)) == pytest.approx(0.3)
 
 
+@pytest.mark.slow
 def test_columns_are_those_of_the_kind() -> None:
     def double(points: np.ndarray, normals: np.ndarray | None) -> np.ndarray:
         return np.tile(np.hstack([points, np.eye(3)[:1].repeat(len(points), 0)]), (2, 1))

@@ -247,6 +247,7 @@ def test_what_was_left_out_while_reading_is_said(place: Path) -> None:
     assert len(read_cloud(place / "dense.ply").points) == 360
 
 
+@pytest.mark.slow
 def test_holes_are_filled_and_flagged(tmp_path: Path) -> None:
     i = np.arange(1500) + 0.5
     z, angle = 1 - 2 * i / 1500, np.pi * (1 + np.sqrt(5)) * i

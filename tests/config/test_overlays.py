@@ -104,6 +104,7 @@ def finished(run: Path) -> bool:
     return json.loads((run / "run.json").read_text())["status"] == "finished"
 
 
+@pytest.mark.slow
 def test_quickstart_takes_patches_of_ones_own(patches: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = patches.with_name("run")
     options = ["trainer.max_steps=1", "trainer.val_check_interval=1", "trainer.limit_val_batches=1", "threads=null"]

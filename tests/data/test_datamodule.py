@@ -97,6 +97,7 @@ def test_strength_is_logarithm_of_density(file: Path) -> None:
     assert len(flat["input"]) == 512
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, pytest.param(4, marks=pytest.mark.slow)])
 def test_same_batches_with_any_number_of_workers(file: Path, workers: int) -> None:
     alone = list(module(file).train_dataloader())

@@ -30,6 +30,7 @@ def test_closed_outward_unit(name: str) -> None:
     assert np.allclose(mesh.vertices.min(0) + mesh.vertices.max(0), 0)
 
 
+@pytest.mark.slow
 def test_distinct() -> None:
     """No two shapes agree in volume and area, and few come close."""
     figures = []

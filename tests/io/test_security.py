@@ -111,7 +111,7 @@ def test_the_pickle_would_have_run(run: Path) -> None:
     assert mark.is_dir()
 
 
-@pytest.mark.parametrize("name", ["os.mkdir", "pickle"])
+@pytest.mark.parametrize("name", ["os.mkdir", pytest.param("pickle", marks=pytest.mark.slow)])
 def test_upsample_runs_nothing(run: Path, name: str) -> None:
     ATTACKS[name](run, run.parent / "mark")
     done = upsample(run)

@@ -17,6 +17,7 @@ def sphere(n: int) -> np.ndarray:
     return np.hstack([points, points])
 
 
+@pytest.mark.slow
 def test_a_hole_narrower_than_the_radius_is_filled_and_no_other() -> None:
     whole = 40 * sphere(4000) + [100, 0, 0, 0, 0, 0]
     whole[:, 3:] /= 40

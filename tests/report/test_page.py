@@ -128,6 +128,7 @@ def browse(page: Path, fragment: str, profile: Path, *, picture: bool = False) -
     return str(shot) if picture else run.stdout
 
 
+@pytest.mark.slow
 @needs_browser
 def test_page_in_a_browser(tmp_path: Path) -> None:
     tables = {"uniform": [table(0.3, 0.1, 0.2)], "noisy": [table(5, 4, 6)]}

@@ -346,6 +346,7 @@ def test_a_finished_run_can_be_made_longer(train: Train) -> None:
     assert yaml.safe_load((run / "config.yaml").read_text())["trainer"]["max_epochs"] == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("steps", "more"),
     [

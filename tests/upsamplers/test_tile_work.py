@@ -115,6 +115,7 @@ def test_given_normals_and_points_stay(tmp_path: Path) -> None:
     np.testing.assert_array_equal(dense[row[given], 3:], normals[given])
 
 
+@pytest.mark.slow
 def test_lines_strays_and_attributes(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     along, across = np.meshgrid(np.arange(0, 20, 0.1), np.arange(0, 20, 1.0))
