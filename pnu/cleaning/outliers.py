@@ -22,10 +22,8 @@ PIECE = 12  # points below which a piece that stands apart is stray
 APART = 6.0  # usual spacings between a piece and all others
 EVEN = 0.45  # breadth of the middle 80 % of nearest distances over their median, below which points keep a distance
 FITS = (0.6, 1.6)  # nearest distances over those around, of points that fit into such an order
-BESIDE, LEVEL = (
-    1.3,
-    0.9,
-)  # local spacings to the nearest point that stays, and to the plane of its own, of one that fits
+BESIDE = 1.3  # local spacings to the nearest point that stays, within which one continues its surface,
+LEVEL = 0.9  # and those to the plane there
 AROUND = 12  # points that such a plane goes through
 FEWEST = 64  # points of a cloud in which strays can be told
 

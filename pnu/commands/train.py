@@ -73,7 +73,8 @@ def train(cfg: Any) -> list[float] | None:
         }
         model, data = networks.build_network(config["model"], allow), parts.pop("data")
         lightning_module.check_input(model, data)
-        if source := config.get("weights"):
+        source = config.get("weights")
+        if source and not run.last.exists():  # a run that goes on has its own
             if source == "previous":
                 record["weights"] = source = str(sweeps.weights_before(run))
             checkpoints.fill(model, checkpoints.load(source, allow).state_dict(), source)

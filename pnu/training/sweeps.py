@@ -105,8 +105,8 @@ def weights_before(run: RunFolder) -> Path:
         ValueError: there is none, or it has not finished.
     """
     number = run.facts.get("job")
-    if number is None:
-        raise ValueError("weights=previous: the job before is meant, in a sweep (-m) alone; give a run folder")
+    if not number:
+        raise ValueError("weights=previous: means the job before in a sweep (-m), and there is none; give a run folder")
     before = [other for other in runs(run.path.parent) if other.read_record().get("job") == number - 1]
     if not before or before[0].read_record().get("status") != "finished":
         raise ValueError(

@@ -232,7 +232,9 @@ def test_a_curriculum_goes_on_from_the_job_before(
     capsys.readouterr()
     with pytest.raises(SystemExit):
         main([*line, "scale=curriculum_256", "sweep=alone"])
-    assert "weights=previous: job -1, which is before this one, has not finished" in capsys.readouterr().err
+    assert "weights=previous: means the job before in a sweep (-m), and there is none" in capsys.readouterr().err
+    main(["resume=true", f"run={folder / second[0]}"])  # alone, beside its sweep
+    assert records(folder)[second[0]]["status"] == "finished"
 
 
 @pytest.mark.slow
