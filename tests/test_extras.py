@@ -1,12 +1,18 @@
 """What not every use needs: extras that name themselves, systems without POSIX, a container."""
 
 import ast
+import importlib.util
+import json
 import os
 import re
+import shlex
+import shutil
 import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from fnmatch import fnmatch
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,7 +29,10 @@ from pnu.runtime import system_libraries
 from pnu.training import sweeps
 
 ROOT = Path(__file__).resolve().parents[1]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+TOML = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PROJECT = TOML["project"]
+WHEEL = TOML["tool"]["hatch"]["build"]["targets"]["wheel"]
+PARTS = {*WHEEL["packages"], *WHEEL["force-include"]}
 ALONE = {"las_child.py", "e57_child.py", "poisson_process.py"}  # processes of their own
 
 
@@ -172,23 +181,126 @@ def test_calls_that_only_posix_has_have_a_fallback(tmp_path: Path, monkeypatch: 
     assert not system_libraries.install(["libgl1"])
 
 
-def test_the_steps_of_the_container() -> None:
-    """What is copied is there and is what the wheel is made of; libraries and extras are those of the project."""
-    text = (ROOT / "Dockerfile").read_text()
-    (python,) = re.findall(r"^FROM python:(3\.\d+)-", text, re.M)
-    assert python in SpecifierSet(PROJECT["requires-python"])
-    copied = [word for line in re.findall(r"^COPY (.*) \S+$", text, re.M) for word in line.split()]
-    assert copied == ["pyproject.toml", "README.md", "LICENSE", "conf", "pnu"]
-    assert all((ROOT / name).exists() for name in copied)
-    kept = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
-    assert kept == {*copied}
-    assert set(system_libraries.LIBRARIES.values()) <= set(text.split())
-    (extras,) = re.findall(r'"\.\[(.*)\]"', text)
-    assert set(extras.split(",")) <= PROJECT["optional-dependencies"].keys()
-    torch = next(line for line in PROJECT["dependencies"] if line.startswith("torch"))
-    assert f'"{torch}"' in text
-    assert text.rstrip().endswith('ENTRYPOINT ["pnu"]')
-    assert "doctor --install --no-system" in text
+DOCKERFILE = (ROOT / "Dockerfile").read_text()
+BROUGHT = {"libX11.so.6": "libgl1", "libudev.so.1": "libusb-1.0-0"}  # by packages that are asked for
+EVERYWHERE = re.compile(r"(lib(c|m|gcc_s|stdc\+\+)|ld-linux-x86-64)\.so\.\d")  # apt itself needs them
+
+
+@pytest.mark.skipif(shutil.which("readelf") is None, reason="no readelf")
+def test_the_libraries_that_open3d_is_linked_to_are_known() -> None:
+    (place,) = importlib.util.find_spec("open3d").submodule_search_locations
+    found = {path for path in Path(place).glob("libOpen3D.so*") if not path.is_symlink()}
+    if not found:
+        pytest.skip("another build of open3d")
+    dynamic = subprocess.run(["readelf", "-d", *found], capture_output=True, text=True, check=True).stdout
+    needed = set(re.findall(r"\(NEEDED\).*\[(.*)\]", dynamic))
+    own = {path.name for path in Path(place).glob("*.so*")}
+    asked = {name for name in needed - own if not EVERYWHERE.fullmatch(name)}
+    assert asked - BROUGHT.keys() <= system_libraries.LIBRARIES.keys()
+    assert {*BROUGHT.values()} <= {*system_libraries.LIBRARIES.values()}
+
+
+def sent(path: str) -> bool:
+    """Whether .dockerignore lets a file of the repository through: the last line that fits decides."""
+    passes = True
+    parts = Path(path).parts
+    for line in (ROOT / ".dockerignore").read_text().split():
+        pattern, back = line.removeprefix("!"), line.startswith("!")
+        anywhere = pattern.removeprefix("**/")
+        starts = range(len(parts)) if anywhere != pattern else [0]
+        fits = [fnmatch("/".join(parts[i:j]), anywhere) for i in starts for j in range(i + 1, len(parts) + 1)]
+        passes = back if any(fits) else passes
+    return passes
+
+
+@cache
+def parsed_by_pip(*arguments: str) -> bool:
+    """Whether pip knows these options; `--help` ends it before it does anything."""
+    return not subprocess.run([sys.executable, "-m", "pip", *arguments, "--help"], capture_output=True).returncode
+
+
+def faults(text: str) -> Iterator[str]:
+    """What would stop a build of the container, or make one that does not work."""
+    user, made, copied, installed = "root", set(), set(), False
+    for word, rest in re.findall(r"^([A-Z]+) (.*)$", text.replace("\\\n", " "), re.M):
+        if word == "FROM":
+            python = re.fullmatch(r"python:(3\.\d+)-slim(-\w+)?", rest)
+            if python is None or python[1] not in SpecifierSet(PROJECT["requires-python"]):
+                yield f"another Python: {rest}"
+        elif word == "COPY":
+            *sources, _ = rest.split()
+            copied |= {*sources}
+            for source in sources:
+                inside = [path for path in (ROOT / source).rglob("*") if "__pycache__" not in path.parts]
+                files = [path.relative_to(ROOT).as_posix() for path in inside if path.is_file()] or [source]
+                if not (ROOT / source).exists() or not all(map(sent, files)):
+                    yield f"not sent to the builder: {source}"
+        elif word == "USER":
+            user = rest
+            if user not in made:
+                yield f"nobody made the user {user}"
+        elif word == "ENTRYPOINT" and json.loads(rest) != [*PROJECT["scripts"]]:
+            yield f"starts {rest}"
+        elif word == "RUN":
+            for program, *arguments in (shlex.split(part) for part in rest.split("&&")):
+                as_root = program in ("apt-get", "useradd", "install") or program == "pip"
+                if as_root is not (user == "root") and program not in ("rm", "chmod"):
+                    yield f"{program} as {user}"
+                if program == "apt-get" and arguments[0] == "install":
+                    packages = {argument for argument in arguments[1:] if not argument.startswith("-")}
+                    for package in packages ^ {*system_libraries.LIBRARIES.values()}:
+                        yield f"system library: {package}"
+                elif program == "pip":
+                    if not parsed_by_pip(*arguments):
+                        yield f"pip does not know {arguments}"
+                    if "--constraint" in arguments and not copied & {arguments[arguments.index("--constraint") + 1]}:
+                        yield "constraints are not there yet"
+                    for extras in re.findall(r"^\.\[(.*)\]$", arguments[-1]):
+                        installed = True
+                        wheel = {"pyproject.toml", PROJECT["readme"], *PROJECT["license-files"], *PARTS}
+                        for name in wheel - copied:
+                            yield f"the wheel is made without {name}"
+                        for extra in {*extras.split(",")} - PROJECT["optional-dependencies"].keys():
+                            yield f"no extra {extra}"
+                elif program == "useradd":
+                    made.add(arguments[-1])
+                elif program == "pnu" and not (installed and {*arguments} <= {"doctor"} | system_libraries.OPTIONS):
+                    yield f"pnu {arguments}"
+    if user in ("root", "0"):
+        yield "runs as root"
+    if not re.search(r"^RUN pnu doctor --install.* && pnu doctor --require\b", text, re.M):
+        yield "nobody sees whether it works"
+
+
+def test_the_container_can_be_built_and_does_not_run_as_root() -> None:
+    assert [*faults(DOCKERFILE)] == []
+    assert sent("pnu/weights/surface.safetensors")  # and the wheel has them, see test_wheel.py
+    assert not sent("outputs/run.json")
+    assert not sent("pnu/__pycache__/train.pyc")
+
+
+@pytest.mark.parametrize(
+    ("line", "faulty", "fault"),
+    [
+        ("COPY conf conf\n", "", "the wheel is made without conf"),
+        ("COPY pnu pnu", "COPY pnu tests pnu", "not sent to the builder: tests"),
+        ("README.md LICENSE", "LICENSE", "the wheel is made without README.md"),
+        ("USER pnu\n", "", "runs as root"),
+        ("USER pnu\n", "", "pnu as root"),
+        ("useradd --create-home pnu", "useradd --create-home somebody", "nobody made the user pnu"),
+        ("libegl1 ", "", "system library: libegl1"),
+        ("poisson,las", "poison,las", "no extra poison"),
+        ("--no-deps", "--no-depends", "pip does not know"),
+        ("COPY constraints.txt ./\n", "", "constraints are not there yet"),
+        ("--no-system", "--nosystem", "pnu ['doctor', '--install', '--nosystem']"),
+        (" && pnu doctor --require", "", "nobody sees whether it works"),
+        ("python:3.13", "python:3.9", "another Python"),
+        ('["pnu"]', '["python"]', 'starts ["python"]'),
+    ],
+)
+def test_faults_of_a_container_are_found(line: str, faulty: str, fault: str) -> None:
+    assert line in DOCKERFILE
+    assert any(found.startswith(fault) for found in faults(DOCKERFILE.replace(line, faulty)))
 
 
 def test_make_leaves_the_system_alone_if_asked() -> None:

@@ -19,7 +19,7 @@ def kernels_line(*, install: bool) -> str:
 
 def main() -> None:
     """`pnu doctor`."""
-    if not set(sys.argv[1:]) - {"--install", "--require", "--no-system"}:
+    if not set(sys.argv[1:]) - system_libraries.OPTIONS:
         print(kernels_line(install="--install" in sys.argv[1:]))
     system_libraries.main()
 

@@ -13,7 +13,13 @@ import subprocess
 import sys
 
 # shared library that `import open3d` loads -> Debian's package
-LIBRARIES = {"libusb-1.0.so.0": "libusb-1.0-0", "libGL.so.1": "libgl1", "libEGL.so.1": "libegl1"}
+LIBRARIES = {
+    "libusb-1.0.so.0": "libusb-1.0-0",
+    "libGL.so.1": "libgl1",
+    "libEGL.so.1": "libegl1",
+    "libidn2.so.0": "libidn2-0",  # of open3d 0.20; most systems have it, Debian 13's small images do not
+}
+OPTIONS = {"--install", "--require", "--no-system"}
 
 
 def missing_packages() -> list[str]:
@@ -55,7 +61,7 @@ def open3d_error() -> str | None:
 def main() -> None:
     """`pnu doctor`."""
     arguments = sys.argv[1:]
-    if set(arguments) - {"--install", "--require", "--no-system"}:
+    if set(arguments) - OPTIONS:
         sys.exit(__doc__)
     missing = missing_packages()
     if missing and "--install" in arguments and "--no-system" not in arguments and install(missing):
