@@ -18,10 +18,10 @@ def full_matrix(query: Tensor, target: Tensor) -> Tensor:
 
 def plain_farthest_points(points: Tensor, m: int) -> Tensor:
     """All distances first, then one row a step."""
-    cloud = torch.arange(len(points))
+    cloud = torch.arange(len(points), device=points.device)
     matrix = full_matrix(points, points)
-    reach = torch.full(points.shape[:2], torch.inf)
-    chosen = torch.zeros(len(points), m, dtype=torch.int64)
+    reach = torch.full(points.shape[:2], torch.inf, device=points.device)
+    chosen = torch.zeros(len(points), m, dtype=torch.int64, device=points.device)
     for i in range(1, m):
         reach = torch.minimum(reach, matrix[cloud, chosen[:, i - 1]])
         chosen[:, i] = reach.argmax(1)
@@ -30,7 +30,11 @@ def plain_farthest_points(points: Tensor, m: int) -> Tensor:
 
 def plain_ball_query(query: Tensor, target: Tensor, radius: float, k: int) -> Tensor:
     n = target.shape[1]
-    found = torch.where(full_matrix(query, target) < radius, torch.arange(n), n).sort(-1).values[..., :k]
+    found = (
+        torch.where(full_matrix(query, target) < radius, torch.arange(n, device=query.device), n)
+        .sort(-1)
+        .values[..., :k]
+    )
     return torch.where(found < n, found, found[..., :1] % n)
 
 

@@ -68,8 +68,14 @@ def data() -> tuple[Tensor, Tensor]:
     return target[:, :POINTS].contiguous(), target
 
 
-def step(network: nn.Module, loss: nn.Module, optimizer: torch.optim.Optimizer) -> Tensor:
-    inputs, target = data()
+def step(
+    network: Callable[[Tensor], Tensor],
+    loss: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    batch: tuple[Tensor, Tensor] | None = None,
+) -> Tensor:
+    """Forward, loss, backward, Adam, on the batch or on `data()`."""
+    inputs, target = batch or data()
     optimizer.zero_grad()
     value = loss(network(inputs), target)["loss"]
     value.backward()

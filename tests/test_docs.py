@@ -189,6 +189,7 @@ def test_a_network_takes_under_60_lines() -> None:
     assert sum(block.count("\n") for block in blocks) < 60
 
 
+@pytest.mark.slow
 def test_the_options_that_the_paper_page_names_exist() -> None:
     options = re.findall(r"`((?:model|loss|optimizer|data)[\w.]*=[\w.-]+)`", text("docs/paper.md"))
     assert len(options) >= 9

@@ -80,6 +80,7 @@ def test_what_is_not_allowed_or_not_there_is_refused(
     assert "mylab" not in sys.modules
 
 
+@pytest.mark.slow
 def test_an_own_loss_network_and_data_train_go_on_and_load(mylab: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(["allow=[mylab]", *ALL, *SHORT, "run=own", "quiet=false"])
     assert "next: pnu upsample input=cloud.ply output=dense.ply run=own 'allow=[mylab]'" in capsys.readouterr().out

@@ -66,6 +66,7 @@ FUNCTIONS = {
 }
 
 
+@pytest.mark.slow
 def test_public_functions_change_nothing(tmp_path: Path) -> None:
     assert set(FUNCTIONS) == set(pnu.__all__) - {"__version__"}
     checks = [f"    check({call!r}, lambda: {call})" for calls in FUNCTIONS.values() for call in calls]

@@ -28,6 +28,8 @@ def prepare(cfg: Any) -> None:
     """Cut patches, or describe a file of them."""
     from pnu.data.patch_file import describe
 
+    if cfg.output and not cfg.describe and Path(cfg.output).suffix not in (".h5", ".hdf5"):
+        raise ValueError(f"output={cfg.output}: expected a name that ends with .h5")
     path = Path(cfg.describe) if cfg.describe else instantiate(cfg.data, "pnu.data").patch_file()
     if cfg.output and not cfg.describe:
         path = copied(path, Path(cfg.output))
@@ -69,8 +71,6 @@ def copied(path: Path, output: Path) -> Path:
 
     from pnu.io import atomic_path
 
-    if output.suffix not in (".h5", ".hdf5"):
-        raise ValueError(f"output={output}: expected a name that ends with .h5")
     output.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(output) as temporary:
         shutil.copyfile(path, temporary)

@@ -71,9 +71,14 @@ def knn(query: Tensor, target: Tensor, k: int) -> tuple[Tensor, Tensor]:
     dist_sq = torch.empty(batch, m, k, device=query.device)
     idx = torch.empty(batch, m, k, dtype=torch.int64, device=query.device)
     slots = triton.next_power_of_2(k)
-    rows, columns = (64, 128) if slots == 1 else (16, max(64, slots))
+    rows, columns = knn_block(slots)
     _knn[(triton.cdiv(m, rows), batch)](query, target, dist_sq, idx, m, n, k, slots, rows, columns)
     return dist_sq, idx
+
+
+def knn_block(slots: int) -> tuple[int, int]:
+    """Queries and targets that a program of `_knn` holds at once, for so many neighbors (a power of two)."""
+    return (64, 128) if slots == 1 else (16, max(64, slots))
 
 
 @triton.jit
@@ -144,7 +149,10 @@ def farthest_points(points: Tensor, m: int, start: Tensor, skip_sq: float = -1.0
     batch, n, _ = points.shape
     idx = torch.empty(batch, m, dtype=torch.int64, device=points.device)
     block = triton.next_power_of_2(n)
-    _farthest[(batch,)](
-        points, start.to(torch.int64), idx, n, m, skip_sq, block, num_warps=min(16, max(1, block // 256))
-    )
+    _farthest[(batch,)](points, start.to(torch.int64), idx, n, m, skip_sq, block, num_warps=farthest_warps(block))
     return idx
+
+
+def farthest_warps(block: int) -> int:
+    """Warps of a program of `_farthest` that holds so many points."""
+    return min(16, max(1, block // 256))

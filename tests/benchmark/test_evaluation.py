@@ -369,6 +369,7 @@ def test_vertices_without_a_face_decide_no_frame(pairs: Path, box: Mesh) -> None
         list(benchmark.case_source({"root": str(pairs)}, truth_points=500, warn=silent).cases)
 
 
+@pytest.mark.slow
 def test_pairs_in_different_frames_are_refused(pairs: Path, box: Mesh) -> None:
     write_mesh(pairs / "truth" / "sink.ply", box)
     with pytest.raises(ValueError, match=r"the truth of sink: is not in the frame of .*sink.xyz"):
@@ -487,6 +488,7 @@ def test_command_refuses(place: Path, capsys: pytest.CaptureFixture[str], argume
     assert sorted(place.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_command_warns_of_open_meshes_and_stops_at_other_frames(
     place: Path, pairs: Path, box: Mesh, capsys: pytest.CaptureFixture[str]
 ) -> None:

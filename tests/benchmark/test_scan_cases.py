@@ -17,6 +17,7 @@ from tests.refusals import ran, refused
 MUG = {"mug": lambda: shapes.make("mug")}
 
 
+@pytest.mark.slow
 def test_scans_are_compared_with_what_they_have_seen() -> None:
     cases = {case.kind: case for case in mesh_cases(MUG, ("random", *SCANS), points=500, truth_points=2000)}
     assert len(cases["random"].truth.samples) == 2000

@@ -156,6 +156,7 @@ def test_scans_have_the_truth_beside_them(kind: str) -> None:
         assert ((toward * scan.clean[:, 3:]).sum(1) > 0).all()  # a sensor sees the side that faces it
 
 
+@pytest.mark.slow
 def test_scanned_clouds_take_weights_of_their_own() -> None:
     cleaned = clean_cloud(Cloud(lines(noise=0.001), None, {}))
     assert cleaned.scanned
@@ -197,6 +198,7 @@ def test_what_continues_the_surface_stays() -> None:
     assert continue_surface(points, flat).tolist() == [True, True, False, False, False]
 
 
+@pytest.mark.slow
 def test_a_cloud_that_thins_out_keeps_its_thin_end() -> None:
     """Photogrammetry has few points where it sees little; between strays elsewhere they were taken for such."""
     mesh = shapes.make("horse")

@@ -46,6 +46,7 @@ def test_conversion(released: dict[str, np.ndarray], capsys: pytest.CaptureFixtu
     assert "exists already" in refused(capsys, main, ["input=epoch_7.pt", "output=run"])
 
 
+@pytest.mark.slow
 def test_bad_input(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     torch.save({"epoch": 1, "model_state_dict": {"encoder.weight": torch.ones(2)}}, "other.pt")
     torch.save({"epoch": 1, "model_state_dict": {"UPSAMPLING_module.20.bias": torch.ones(6)}}, "part.pt")

@@ -132,6 +132,7 @@ def test_viewpoint_of_a_pcd(place: Path, viewpoint: str, comment: str, expected:
         np.testing.assert_allclose(found.viewpoint, expected)
 
 
+@pytest.mark.slow
 def test_sensor_of_a_pcd_or_in_columns(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     Path("c.pcd").write_bytes(pcd("0 0 0.25 1 0 0 0"))
     main(["input=c.pcd", "output=out.ply"])
@@ -265,6 +266,7 @@ def test_upsample_takes_the_same_keys(place: Path, capsys: pytest.CaptureFixture
     assert outward("dense.ply") == 1
 
 
+@pytest.mark.slow
 def test_upsample_takes_weights_for_estimated_normals_where_the_file_has_none(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -276,6 +278,7 @@ def test_upsample_takes_weights_for_estimated_normals_where_the_file_has_none(
     assert "run:    surface (comes with pnu)" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_what_a_las_says_is_enough_for_upsample(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     las("c.las", scan_angle_rank=ANGLES, return_number=1, number_of_returns=1)
     line = notes(capsys, "upsample", "input=c.las", "output=dense.ply", "ratio=2")

@@ -109,6 +109,7 @@ def test_a_file_with_one_bad_patch_is_not_recommended(
     assert f"{path}: patch 33 of poisson_4096 holds NaN or infinity" in message
 
 
+@pytest.mark.slow
 def test_meshes_with_open_edges_are_counted(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     dice = shapes.make("dice")
     write_mesh(folder / "meshes/open.off", Mesh(dice.vertices, dice.faces[1:]))
@@ -140,3 +141,4 @@ def test_output_with_a_wrong_suffix(folder: Path, capsys: pytest.CaptureFixture[
     with pytest.raises(SystemExit):
         prepare(folder, "quiet=true", f"output={folder / 'patches.ply'}")
     assert "expected a name that ends with .h5" in capsys.readouterr().err
+    assert not (folder / "cache").exists(), "it is said after the work"

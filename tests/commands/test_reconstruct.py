@@ -56,6 +56,7 @@ def test_mesh_and_its_errors(folder: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_colors_of_the_cloud_and_trimming(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(reconstruct, input=folder / "cloud.ply", output=tmp_path / "a.ply", depth=5, trim=0.2)
     said = capsys.readouterr().out
@@ -74,6 +75,7 @@ def test_normals_are_estimated_where_missing(tmp_path: Path, capsys: pytest.Capt
     assert signed_volume(read_mesh(tmp_path / "bare.stl")) == pytest.approx(4 / 3 * np.pi, rel=0.03)
 
 
+@pytest.mark.slow
 def test_open_truth_and_inward_normals_are_said(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

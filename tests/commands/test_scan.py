@@ -51,6 +51,7 @@ def test_a_bowl_with_strays_becomes_a_clean_sheet(place: Path, capsys: pytest.Ca
     assert (colored[:, :3] == [10, 200, 30]).all()
 
 
+@pytest.mark.slow
 def test_what_is_wrong_is_said_before_the_work(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wrong = {
         "output=mesh.xyz": "output=mesh.xyz: expected a mesh",
@@ -73,6 +74,7 @@ def test_quiet_prints_nothing(place: Path, capsys: pytest.CaptureFixture[str]) -
     assert capsys.readouterr() == ("", "")
 
 
+@pytest.mark.slow
 def test_a_surface_is_cut_off_where_its_points_end() -> None:
     points = bowl(2000)
     surface = reconstruction.reconstruct(points, points)

@@ -57,6 +57,7 @@ def test_a_cloud_within_a_memory(place: Path) -> None:
     assert [path.name for path in (place / NASTY).iterdir()] == ["dense.ply"]
 
 
+@pytest.mark.slow
 def test_tiles_as_jobs_give_the_same_bits(place: Path) -> None:
     assert tiled(place, "output=whole.ply", "tiles=all", "quiet=true").returncode == 0
     (place / NASTY).mkdir()

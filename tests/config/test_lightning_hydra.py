@@ -137,6 +137,7 @@ def test_fast_dev_run_goes_through_once_and_keeps_nothing(train: Any, capsys: py
     assert "no checkpoint was kept: trainer.fast_dev_run" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_arguments_of_the_trainer_that_conf_does_not_show(train: Any) -> None:
     run = train(*EXTRA.split())
     assert steps(run) == 4
@@ -157,6 +158,7 @@ def test_csv_and_several_loggers(train: Any) -> None:
         assert [row["step"] for row in csv.DictReader(file) if row["train/loss"]] == ["2", "3"]
 
 
+@pytest.mark.slow
 def test_one_logger_or_none(train: Any) -> None:
     run = train(CSV)
     assert (run / "csv" / "metrics.csv").is_file()
@@ -226,6 +228,7 @@ def test_sanity_steps_count_for_nothing(train: Any) -> None:
     assert (run / "metrics.json").read_text() == (plain / "metrics.json").read_text()
 
 
+@pytest.mark.slow
 def test_hydras_folder_is_the_run_folder(train: Any, tmp_path: Path) -> None:
     for options in (FOLDER, CHDIR):
         name = f"there_{len(options)}"
@@ -259,6 +262,7 @@ def message(train: Any, capsys: pytest.CaptureFixture[str], patch_file: Path) ->
     return of
 
 
+@pytest.mark.slow
 def test_what_has_no_use_here_says_why(message: Callable[[str], str]) -> None:
     found = {typed: message(typed) for typed in REFUSED}
     page = INTRO + "".join(f"| `{typed}` | {does} |\n" for typed, does in TABLE.items())
@@ -320,6 +324,7 @@ def test_mlflow_in_a_folder(train: Any) -> None:
     assert list(run.glob("mlflow/*/*/metrics/train/loss"))
 
 
+@pytest.mark.slow
 def test_the_arguments_of_a_logger_reach_it(train: Any, patch_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a stand-in for the class of Lightning, as the package behind it may not be installed."""
     import lightning.pytorch.loggers as loggers

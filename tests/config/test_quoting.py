@@ -294,6 +294,7 @@ def test_a_name_that_is_taken(say: Say, capsys: pytest.CaptureFixture[str]) -> N
     assert parse(words(cure))[0].value() == ["NAME:apss"]
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped(say: Say, trained: str, capsys: pytest.CaptureFixture[str]) -> None:
     run = RunFolder(in_nasty("run"))
     with pytest.raises(SystemExit), run.recorded({}):

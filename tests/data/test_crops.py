@@ -288,6 +288,7 @@ def test_crops_of_the_greatest_and_the_least_size_stack(meshes: dict[str, Mesh],
     assert flattened([crops[0, i] for i in range(4)])["input"].shape == (4, size, 6)
 
 
+@pytest.mark.slow
 def test_data_module_and_a_few_steps(tmp_path, meshes: dict[str, Mesh]) -> None:
     for name, mesh in meshes.items():
         write_mesh(tmp_path / f"{name}.ply", mesh)

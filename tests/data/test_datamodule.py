@@ -117,6 +117,7 @@ def test_epochs_and_seeds_differ(file: Path) -> None:
     assert equal(first, list(module(file).train_dataloader()))
 
 
+@pytest.mark.slow
 def test_validation_does_not_depend_on_seed_or_augmentation(file: Path) -> None:
     assert equal(
         list(module(file, seed=5).val_dataloader()), list(module(file, augmentation=None, workers=1).val_dataloader())

@@ -1,10 +1,15 @@
 """Triton kernels against their slow twins: on a GPU where there is one, in Triton's interpreter elsewhere."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 from torch import Tensor
 
-from pnu.geometry import sampling
+from pnu.geometry import neighbor_search, sampling
 
 try:
     from pnu.geometry import triton_kernels
@@ -77,3 +82,122 @@ def test_farthest_points(skip_sq: float) -> None:
             distance = distance.minimum((points[b] - points[b, chosen[-1]]).square().sum(-1))
             chosen.append(int(distance.argmax()))
         assert idx[b].tolist() == chosen
+
+
+def awkward(kind: str, batch: int, n: int) -> Tensor:
+    """Clouds that kernels stumble over."""
+    points = cloud(batch, n)
+    if kind == "duplicates":
+        return points[:, torch.arange(n) // 3]
+    if kind == "one place":
+        return points[:, :1].expand(-1, n, -1).contiguous()
+    if kind == "far away":
+        return points + 100
+    return points.double() if kind == "float64" else points
+
+
+KINDS = ["duplicates", "one place", "far away", "float64"]
+BOUNDS = [(1, 1, 1), (65, 129, 1), (17, 65, 2), (3, 64, 64), (2, 127, 33)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("m", "n", "k"), BOUNDS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_knn_of_awkward_clouds(kind: str, m: int, n: int, k: int) -> None:
+    """Sizes that are no multiple of a block, k at its bounds (1, n, `KERNEL_K`): the twin's distances and order."""
+    query, target = awkward(kind, 1, m), awkward(kind, 1, n)
+    dist_sq, idx = triton_kernels.knn(query.to(DEVICE), target.to(DEVICE), k)
+    expected = distances_sq(query.float(), target.float())
+    assert dist_sq.dtype == torch.float32
+    torch.testing.assert_close(dist_sq.cpu(), expected.sort(dim=-1, stable=True).values[..., :k])
+    torch.testing.assert_close(dist_sq.cpu(), expected.gather(-1, idx.cpu()))
+    assert all(len(row.unique()) == k for row in idx.cpu().flatten(0, 1)), "a neighbor twice"
+    tied = dist_sq.cpu().diff(dim=-1) == 0
+    assert (idx.cpu().diff(dim=-1)[tied] > 0).all(), "of equal ones the lower index comes first"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("m", "n", "k"), [(1, 1, 1), (17, 127, 64), (5, 129, 3), (3, 40, 64)])
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("radius", [1e-3, 0.3, 10.0])
+def test_balls_of_awkward_clouds(kind: str, m: int, n: int, k: int, radius: float) -> None:
+    """Balls that hold nothing, some and everything; more places than points."""
+    query, target = awkward(kind, 2, m), awkward(kind, 2, n)
+    idx = triton_kernels.ball_query(query.to(DEVICE), target.to(DEVICE), radius, k).cpu()
+    inside = distances_sq(query.float(), target.float()).sqrt() < radius
+    for b in range(2):
+        for i in range(m):
+            found = inside[b, i].nonzero()[:k, 0].tolist()
+            assert idx[b, i].tolist() == found + [found[0] if found else 0] * (k - len(found))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (65, 65), (127, 1), (129, 40)])
+@pytest.mark.parametrize("kind", KINDS)
+def test_farthest_points_of_awkward_clouds(kind: str, n: int, m: int) -> None:
+    """As the plain steps say, from the last point on; all different."""
+    points, start = awkward(kind, 2, n), torch.tensor([n - 1, 0])
+    idx = triton_kernels.farthest_points(points.to(DEVICE), m, start.to(DEVICE)).cpu()
+    assert torch.equal(idx, sampling._farthest_steps(points.float(), m, start, False))
+    assert all(len(row.unique()) == m for row in idx)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_searches_take_the_kernels(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    """The doors that a GPU's clouds go through give what the CPU's trees give, in the query's dtype."""
+    query, target = awkward(kind, 2, 19).to(DEVICE), awkward(kind, 2, 70).to(DEVICE)
+    trees = neighbor_search.knn(query.cpu(), target.cpu(), 5)
+    ball = neighbor_search.ball_query(query.cpu(), target.cpu(), 0.3, 5)
+    kernel = neighbor_search._knn_kernel(triton_kernels, query, target, 5)
+    assert kernel.dist_sq.dtype == query.dtype
+    torch.testing.assert_close(
+        kernel.dist_sq.cpu(), trees.dist_sq, rtol=1e-4, atol=2e-5 if kind == "far away" else 1e-7
+    )
+    assert torch.equal(triton_kernels.ball_query(query, target, 0.3, 5).cpu(), ball)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("capability", [80, 90])
+def test_kernels_compile_for_a_gpu_that_is_not_here(capability: int, tmp_path: Path) -> None:
+    """Each kernel, in the sizes at its bounds, down to the machine code of an A100 and an H100."""
+    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
+    environment["TRITON_CACHE_DIR"] = str(tmp_path)
+    made = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", AHEAD.format(capability=capability)],
+        env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if "nothing compiles here" in made.stderr:
+        pytest.skip(made.stderr.strip())
+    assert made.returncode == 0, made.stderr
+    sizes = [int(line) for line in made.stdout.split()]
+    assert len(sizes) == 8
+    assert min(sizes) > 1000
+
+
+AHEAD = """
+import sys
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from pnu.geometry import triton_kernels as kernels
+
+if "nvidia" not in triton.backends.backends:
+    sys.exit("nothing compiles here: this Triton has no NVIDIA backend")
+FLOAT, INDEX = "*fp32", "*i64"
+
+def compiled(kernel, types, warps=4, **constants):
+    names = kernel.arg_names
+    signature = dict(zip(names, [*types, *["constexpr"] * len(constants)], strict=True))
+    source = ASTSource(kernel, signature=signature, constexprs=constants)
+    built = triton.compile(source, target=GPUTarget("cuda", {capability}, 32), options=dict(num_warps=warps))
+    print(len(built.asm["cubin"]))
+
+for k in (1, 2, 16, 64):
+    rows, columns = kernels.knn_block(k)
+    compiled(kernels._knn, [FLOAT, FLOAT, FLOAT, INDEX, "i32", "i32", "i32"], K=k, ROWS=rows, COLUMNS=columns)
+for k in (1, 64):
+    compiled(kernels._ball, [FLOAT, FLOAT, INDEX, "i32", "i32", "i32", "fp32"], K=k, ROWS=16, COLUMNS=128)
+for n in (1, kernels.FARTHEST_LIMIT):
+    compiled(kernels._farthest, [FLOAT, INDEX, INDEX, "i32", "i32", "fp32"], kernels.farthest_warps(n), BLOCK=n)
+"""

@@ -19,7 +19,7 @@ def cloud(clouds: int, n: int, *, seed: int, dtype: torch.dtype = torch.float64)
     return torch.rand(clouds, n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
 
 
-@pytest.fixture(params=["tree", "kernel", "chunks", "tiny chunks"])
+@pytest.fixture(params=["tree", pytest.param("kernel", marks=pytest.mark.slow), "chunks", "tiny chunks"])
 def path(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """The tree of the CPU, and on the CPU what other devices take: kernels, chunks whole or a few rows at a time."""
     if request.param == "kernel":

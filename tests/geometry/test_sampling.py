@@ -144,6 +144,7 @@ def test_without_strength_the_draw_is_uniform() -> None:
     assert (torch.bincount(idx.flatten(), minlength=8) / 4000 - 3 / 8).abs().max() < 0.04
 
 
+@pytest.mark.slow
 def test_first_draw_follows_the_weights() -> None:
     # a line of 5 points; with one center c the weight of point i is exp(-strength |i - c| / max |j - c|)
     points = torch.zeros(1, 5, 3)

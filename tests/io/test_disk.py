@@ -61,6 +61,7 @@ def refused(done: subprocess.CompletedProcess[str], reason: str) -> None:
     assert reason in line
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("untraced")
 def test_every_writer_sees_that_the_disk_is_full(tmp_path: Path) -> None:
     """A limit on the size of a file stands for the disk; 2 kB are less than any of these files."""

@@ -418,6 +418,7 @@ def ask(swept: Path) -> Iterator[Callable[..., Any]]:
         process.wait()
 
 
+@pytest.mark.slow
 def test_curves_of_all_runs_have_the_same_names(ask: Callable[..., Any], swept: Path) -> None:
     tags = ask("data/plugin/scalars/tags")
     assert len(tags) == 4
@@ -426,6 +427,7 @@ def test_curves_of_all_runs_have_the_same_names(ask: Callable[..., Any], swept: 
     assert {Path(run).parts[0] for run in tags} == {path.parent.name for path in swept.glob("*/run.json")}
 
 
+@pytest.mark.slow
 def test_clouds_are_served_with_points_and_colors(ask: Callable[..., Any]) -> None:
     tags = ask("data/plugin/mesh/tags")
     assert len(tags) == 4
@@ -440,6 +442,7 @@ def test_clouds_are_served_with_points_and_colors(ask: Callable[..., Any]) -> No
     assert colors.std() > 20
 
 
+@pytest.mark.slow
 def test_hyperparameters_are_served_with_the_final_metrics(ask: Callable[..., Any], swept: Path) -> None:
     experiment = ask("data/plugin/hparams/experiment", {})
     assert "test/chamfer_sq" in {info["name"]["tag"] for info in experiment["metricInfos"]}
@@ -463,6 +466,7 @@ def test_hyperparameters_are_served_with_the_final_metrics(ask: Callable[..., An
     assert found == expected
 
 
+@pytest.mark.slow
 def test_config_is_served_as_text(ask: Callable[..., Any]) -> None:
     tags = ask("data/plugin/text/tags")
     run, names = next(iter(tags.items()))
