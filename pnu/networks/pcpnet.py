@@ -60,8 +60,7 @@ class PCPNet(nn.Module):
 
     def __init__(self, neighbors: Sequence[int] = (16, 48, 128), width: float = 0.25, oriented: bool = False) -> None:
         super().__init__()
-        if not neighbors or list(neighbors) != sorted(set(neighbors)) or neighbors[0] < SMALLEST:
-            raise ValueError(f"model.neighbors={list(neighbors)}: expected ascending numbers from {SMALLEST} on")
+        check_scales(neighbors)
         if not 0 < width <= 1:
             raise ValueError(f"model.width={width}: expected a share above 0, at most 1")
         self.neighbors, self.oriented = tuple(neighbors), oriented
@@ -76,8 +75,7 @@ class PCPNet(nn.Module):
 
     def check_input(self, key: str, points: int) -> None:
         """ValueError where neighborhoods have too few points for the largest scale."""
-        if points < self.neighbors[-1]:
-            raise ValueError(f"{key}={points}: expected at least {self.neighbors[-1]}, the largest of model.neighbors")
+        check_size(key, points, self.neighbors)
 
     def forward(self, neighborhoods: Tensor) -> Tensor:
         self.check_input("neighbors", neighborhoods.shape[2])
@@ -95,6 +93,18 @@ class PCPNet(nn.Module):
     def outputs(self, neighborhoods: Tensor) -> dict[str, Tensor]:
         """What the loss may read: here the prediction alone."""
         return {"prediction": self(neighborhoods)}
+
+
+def check_scales(neighbors: Sequence[int]) -> None:
+    """ValueError for numbers of neighbors that are no scales of neighborhoods."""
+    if not neighbors or list(neighbors) != sorted(set(neighbors)) or neighbors[0] < SMALLEST:
+        raise ValueError(f"model.neighbors={list(neighbors)}: expected ascending numbers from {SMALLEST} on")
+
+
+def check_size(key: str, points: int, neighbors: Sequence[int]) -> None:
+    """ValueError for neighborhoods of fewer points than their largest scale."""
+    if points < neighbors[-1]:
+        raise ValueError(f"{key}={points}: expected at least {neighbors[-1]}, the largest of model.neighbors")
 
 
 def rotation(quaternions: Tensor) -> Tensor:
