@@ -5,7 +5,16 @@ from pnu.benchmark.cases import KINDS, SCANS, Case, Truth, mesh_cases, pair_case
 from pnu.benchmark.measuring import Method, Row, evaluate, measure, measured_network, network_upsampler, of_kinds
 from pnu.benchmark.open3d_chain import open3d_chain
 from pnu.benchmark.protocols import Protocol, print_published
-from pnu.benchmark.result_tables import columns, legend, print_tables, result_folder, summarize, write_results
+from pnu.benchmark.result_tables import (
+    columns,
+    legend,
+    over_seeds,
+    print_over_seeds,
+    print_tables,
+    result_folder,
+    summarize,
+    write_results,
+)
 
 __all__ = [
     "KINDS",
@@ -27,7 +36,9 @@ __all__ = [
     "network_upsampler",
     "of_kinds",
     "open3d_chain",
+    "over_seeds",
     "pair_cases",
+    "print_over_seeds",
     "print_published",
     "print_tables",
     "result_folder",

@@ -106,6 +106,7 @@ def network_upsampler(
     ratio: float,
     *,
     passes: bool = False,
+    keep: bool | str = "auto",
     name: str = "run",
     **options: Any,
 ) -> Method:
@@ -113,7 +114,7 @@ def network_upsampler(
 
     Raises:
         ValueError: the network was trained for another ratio, and `passes` does not allow to reach this one by several
-            passes or by leaving points out.
+            passes or by leaving points out; or `keep` is true, and the method does not keep the points given.
     """
     trained = getattr(model, "ratio", None)
     patches = not isinstance(model, str) and isinstance(upsamplers.upsampler_of(model), upsamplers.Patches)
@@ -122,8 +123,11 @@ def network_upsampler(
             f"ratio={ratio:g}: {name} was trained for {trained}; give ratio={trained}, or passes=true to "
             f"reach {ratio:g} by passes and farthest points"
         )
+    kept: Any = {"true": True, "false": False}.get(str(keep).lower(), keep)
+    if kept is True and not isinstance(model, str) and not getattr(upsamplers.upsampler_of(model), "follows", False):
+        raise ValueError(f"keep=true: {name} spreads all points anew; give it to surface alone")
 
     def upsampler(points: np.ndarray, normals: np.ndarray | None) -> np.ndarray:
-        return whole_clouds.upsample(points, normals, ratio=ratio, model=model, **options)
+        return whole_clouds.upsample(points, normals, ratio=ratio, model=model, keep=kept, **options)
 
     return upsampler

@@ -58,6 +58,40 @@ def summarize(rows: Iterable[Row], metrics: Sequence[Metric] = METRICS) -> list[
     return result
 
 
+def over_seeds(rows: Iterable[Row], metrics: Sequence[Metric] = METRICS) -> list[Row]:
+    """Mean and standard deviation over runs that differ in their seed alone, of each run's mean over the shapes: keys
+    `<metric>` and `<metric>_std`, and `seeds`. Runs of a sweep are told apart by their names, NAME_seed-N.
+    """
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for summary in summarize(rows, metrics):
+        name, found, _ = summary["method"].rpartition("_seed-")
+        if found:
+            groups.setdefault((summary["kind"], name), []).append(summary | {"method": name})
+    repeated = [row for members in groups.values() if len(members) > 1 for row in members]
+    return [{"seeds" if key == "shapes" else key: row[key] for key in row} for row in summarize(repeated, metrics)]
+
+
+def print_over_seeds(rows: Sequence[Row], metrics: Sequence[Metric] = METRICS) -> None:
+    """A table for each kind of input, where there are runs that differ in their seed alone."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(width=max(Console().width, 118), highlight=False)
+    found = over_seeds(rows, metrics)
+    for kind in dict.fromkeys(row["kind"] for row in found):
+        of_kind = [row for row in found if row["kind"] == kind]
+        all_shown = columns([row for row in rows if row["kind"] == kind], metrics)
+        table = Table(title=f"{kind}: mean ± standard deviation over seeds", title_justify="left", title_style="bold")
+        for head in ("method", "seeds"):
+            table.add_column(head)
+        for shown in all_shown:
+            table.add_column(shown.head or shown.title, justify="right")
+        for row in of_kind:
+            cells = (f"{row_cell(row, s)} ± {s.text(row.get(f'{s.name}_std'))}" for s in all_shown)
+            table.add_row(row["method"], str(row["seeds"]), *cells)
+        console.print(table)
+
+
 def print_tables(rows: Sequence[Row], head: str, metrics: Sequence[Metric] = METRICS) -> None:
     """A table for each kind of input: every shape, then mean and spread, then the references' means."""
     from rich.console import Console
@@ -116,6 +150,7 @@ def write_results(
         "legend": legend(rows, metrics),
         "rows": list(rows),
         "summary": summarize(rows, metrics),
+        "over_seeds": over_seeds(rows, metrics),
     }
     write_json(folder / "metrics.json", content)
 

@@ -13,6 +13,8 @@ KINDS = (
     "simulated scans: orbit, oneview, lines, photo, flipped; null: the protocol's"
 )
 
+KEEP = "of surface: true: the points given are in the result, unmoved; false: all are new; auto: as pnu upsample"
+
 
 def protocol_source(cfg: Any) -> tuple["Protocol", "CaseSource"]:
     """The protocol, and the cases that it makes of `data`; keys of the command go before what the protocol says."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pnu.commands._entry import command, warn
-from pnu.commands._protocol import KINDS, protocol_source
+from pnu.commands._protocol import KEEP, KINDS, protocol_source
 from pnu.config.instantiate import find_metric
 from pnu.config.quoting import quoted, typed_line
 from pnu.config.schema import Group, doc
@@ -41,6 +41,7 @@ class Compare:
     )
     ratio: float = doc("points out for each point in")
     passes: bool = doc("also networks that were trained for another ratio: by passes and farthest points")
+    keep: str = doc(KEEP)
     normals: str = doc("of the inputs: given, those of the shape; estimate, for which surface_estimated is made")
     metrics: list[str] = doc("classes of metrics of your own, measured beside pnu's: [mylab.Roughness]")
     allow: list[str] = doc("packages of your own whose classes may be named, such as [mylab]")
@@ -89,6 +90,7 @@ def compare(cfg: Any) -> None:
         rows = list(benchmark.evaluate(methods, source.cases, **options))
     if not cfg.quiet:
         benchmark.print_tables(rows, f"{', '.join(methods)} on {source.name}", chosen)
+        benchmark.print_over_seeds(rows, chosen)
         benchmark.print_published(protocol.published_rows(cfg.ratio))
     with steps(len(shown), cfg.quiet) as step:
         written = comparison_page.write_comparison(
@@ -119,7 +121,7 @@ def compare(cfg: Any) -> None:
         print(f"next:   open {output}/index.html in a browser")
 
 
-SETTINGS = ("methods", "points", "truth_points", "ratio", "normals", "seed")
+SETTINGS = ("methods", "points", "truth_points", "ratio", "keep", "normals", "seed")
 
 
 def upsamplers(cfg: Any) -> dict[str, "Method"]:
@@ -155,6 +157,7 @@ def upsamplers(cfg: Any) -> dict[str, "Method"]:
             model,
             cfg.ratio,
             passes=cfg.passes,
+            keep=cfg.keep,
             name=method,
             batch_size=cfg.batch_size,
             device=cfg.device,

@@ -185,6 +185,19 @@ def test_a_network_of_another_ratio_needs_leave() -> None:
     assert len(benchmark.network_upsampler(network, 2)(points, points)) == 200
 
 
+def test_rows_with_the_points_given_in_them() -> None:
+    points = np.random.default_rng(0).normal(size=(300, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    kept, new = (benchmark.network_upsampler("surface", 2, keep=keep)(points, points) for keep in ("true", False))
+    assert len(kept) == len(new) == 600
+    np.testing.assert_array_equal(kept[:300, :3], points)
+    assert not np.isin(points[:, 0], new[:, 0]).any()
+    with pytest.raises(ValueError, match="keep=true: midpoint spreads all points anew; give it to surface alone"):
+        benchmark.network_upsampler(classical("midpoint"), 2, keep="true", name="midpoint")
+    with pytest.raises(ValueError, match="keep=maybe: expected true, false or auto"):
+        benchmark.network_upsampler("surface", 2, keep="maybe")(points, points)
+
+
 def test_summary_by_hand() -> None:
     rows = [
         {"shape": s, "kind": "random", "method": "m", "chamfer_sq": v, **more}
@@ -198,6 +211,28 @@ def test_summary_by_hand() -> None:
     chamfer, p2f = benchmark.columns(rows)
     assert result_tables.row_cell(summary, p2f) == "-"
     assert result_tables.row_cell(summary, chamfer) == "4000.0000"
+
+
+def test_spread_over_seeds_by_hand(capsys: pytest.CaptureFixture[str]) -> None:
+    """Means over two shapes are 2, 4 and 9: mean 5, variance (9 + 1 + 16) / 2. One seed has no spread."""
+    values = {
+        "wide_seed-0": (1, 3),
+        "wide_seed-1": (3, 5),
+        "wide_seed-2": (8, 10),
+        "slim_seed-0": (1, 1),
+        "apss": (1, 1),
+    }
+    rows = [
+        {"shape": shape, "kind": "random", "method": method, "chamfer_sq": 1e-3 * value}
+        for method, pair in values.items()
+        for shape, value in zip("ab", pair, strict=True)
+    ]
+    (found,) = benchmark.over_seeds(rows)
+    assert (found["method"], found["seeds"], found["kind"]) == ("wide", 3, "random")
+    assert found["chamfer_sq"] == pytest.approx(5e-3)
+    assert found["chamfer_sq_std"] == pytest.approx(1e-3 * math.sqrt(13))
+    benchmark.print_over_seeds(rows)
+    assert "5.0000 ± 3.6056" in capsys.readouterr().out
 
 
 def test_cost_sees_memory_and_children() -> None:
