@@ -53,29 +53,44 @@ class Inception(nn.Module):
         return torch.cat([entry, self.near(entry), self.far(entry), self.pooled(local_means(x, self.smaller))], -1)
 
 
-class GridFeatures(nn.Module):
-    """Inception modules and maxima of a table, on cubes (N, g, g, g, C): (N, self.width)."""
+class Halving(nn.Module):
+    """Maxima over kernel^3 cells at every second one of cubes (N, g, g, g, C): (N, h, h, h, C), h = g / 2, rounded up.
+    A kernel of 3 is centered at its cell, one of 2 begins there."""
 
-    def __init__(self, width_in: int, grid: int, table: Table, width: float, sharing: int = 1) -> None:
-        """The first module has a `sharing`-th of its channels, so that an expert of more scales is no larger."""
+    def __init__(self, kernel: int) -> None:
         super().__init__()
-        self.modules_and_maxima = nn.ModuleList()
-        self.small = grid <= SMALL_GRID
-        for row in table:
-            if row is None:
-                self.modules_and_maxima.append(nn.Identity())
-                grid = -(-grid // 2)
-                continue
-            share = width if len(self.modules_and_maxima) else width / sharing
-            channels = 2 * max(2, round(share * row[0] / 2))
-            self.modules_and_maxima.append(Inception(width_in, channels, *row[1:]))
-            width_in = 3 * channels
-        self.width = width_in * grid**3
+        self.kernel = kernel
 
     def forward(self, x: Tensor) -> Tensor:
-        for module in self.modules_and_maxima:
-            x = module(x) if isinstance(module, Inception) else halved(x, 3 if self.small else 2)
-        return x.flatten(1)
+        padding, odd = (self.kernel - 1) // 2, bool(self.kernel % 2)
+        maxima: Tensor = max_pool3d(x.movedim(-1, 1), self.kernel, 2, padding=padding, ceil_mode=not odd)
+        return maxima.movedim(1, -1)
+
+
+class GridFeatures(nn.Module):
+    """Inception modules and maxima of a table, on cubes (N, g, g, g, C): (N, self.width).
+
+    The first module has a `sharing`-th of its channels, so that an expert of more scales is no larger.
+    """
+
+    def __init__(self, width_in: int, grid: int, table: Table, width: float, sharing: int = 1) -> None:
+        super().__init__()
+        steps: list[nn.Module] = []
+        kernel = 3 if grid <= SMALL_GRID else 2
+        for row in table:
+            if row is None:
+                steps.append(Halving(kernel))
+                grid = -(-grid // 2)
+                continue
+            share = width if steps else width / sharing
+            channels = 2 * max(2, round(share * row[0] / 2))
+            steps.append(Inception(width_in, channels, *row[1:]))
+            width_in = 3 * channels
+        self.modules_and_maxima, self.width = nn.Sequential(*steps), width_in * grid**3
+
+    def forward(self, x: Tensor) -> Tensor:
+        features: Tensor = self.modules_and_maxima(x)
+        return features.flatten(1)
 
 
 class NestiNet(nn.Module):
@@ -193,10 +208,3 @@ def local_means(x: Tensor, kernel: int) -> Tensor:
     count = avg_pool3d(zero_padded(torch.ones_like(x[:1, ..., 0]), kernel), kernel, 1)
     means: Tensor = avg_pool3d(zero_padded(x.movedim(-1, 1), kernel), kernel, 1) / count
     return means.movedim(1, -1)
-
-
-def halved(x: Tensor, kernel: int) -> Tensor:
-    """Maxima over kernel^3 cells at every second one of cubes (N, g, g, g, C): (N, h, h, h, C), h = g / 2, rounded up.
-    A kernel of 3 is centered at its cell, one of 2 begins there."""
-    maxima: Tensor = max_pool3d(x.movedim(-1, 1), kernel, 2, padding=(kernel - 1) // 2, ceil_mode=kernel == 2)
-    return maxima.movedim(1, -1)

@@ -145,13 +145,15 @@ def test_every_experiment_runs_a_step(overlay: str, source: str, patches: Path, 
 
 
 @pytest.mark.slow
-def test_the_experiment_of_normals_runs_a_step(tmp_path: Path) -> None:
+@pytest.mark.parametrize("model", ["pcpnet", "nestinet"])
+def test_the_experiment_of_normals_runs_a_step(tmp_path: Path, model: str) -> None:
     data = ["data.clouds=2", "data.points=300", "data.queries=4", "data.batch_size=1"]
     steps = ["trainer.max_steps=1", "trainer.val_check_interval=1", "trainer.limit_val_batches=1"]
     run = tmp_path / "run"
     main(
         [
             "experiment=normals",
+            f"model={model}",
             *data,
             *steps,
             "trainer.limit_test_batches=1",

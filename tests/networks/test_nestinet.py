@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader
 from pnu.benchmark import normal_task
 from pnu.losses import NormalLoss
 from pnu.networks.fisher_vectors import fisher_vectors, grid_centers, normalized_vectors
-from pnu.networks.nestinet import NestiNet, halved, local_means
+from pnu.networks.nestinet import Halving, NestiNet, local_means
 from pnu.training.lightning_module import UpsamplingModule
 from tests.networks.test_pcpnet import neighborhoods, patches
 from tests.reconstruction.test_surfaces import icosphere
@@ -111,9 +111,9 @@ def test_pooling_by_hand() -> None:
     line = torch.arange(3.0)[None, :, None, None, None].expand(1, 3, 3, 3, 1)
     assert local_means(line, 3)[0, :, 0, 0, 0].tolist() == pytest.approx([0.5, 1, 1.5])
     assert local_means(line, 2)[0, :, 1, 1, 0].tolist() == pytest.approx([0.5, 1.5, 2])
-    assert halved(line, 3)[0, :, 0, 0, 0].tolist() == [1, 2]
-    assert halved(line, 2)[0, :, 0, 0, 0].tolist() == [1, 2]
-    assert halved(line[:, :1, :1, :1], 2).shape == (1, 1, 1, 1, 1)
+    assert Halving(3)(line)[0, :, 0, 0, 0].tolist() == [1, 2]
+    assert Halving(2)(line)[0, :, 0, 0, 0].tolist() == [1, 2]
+    assert Halving(2)(line[:, :1, :1, :1]).shape == (1, 1, 1, 1, 1)
 
 
 @pytest.mark.parametrize("grid", [2, 3, 5])
