@@ -57,7 +57,9 @@ def metrics(folder: Path) -> dict[str, dict]:
 # --- the configs ---
 
 
-@pytest.mark.parametrize("ablation", ABLATIONS)
+@pytest.mark.parametrize(
+    "ablation", [pytest.param(name, marks=[] if name == "normals" else pytest.mark.slow) for name in ABLATIONS]
+)
 def test_every_setting_changes_the_config_of_its_ablation(ablation: str) -> None:
     with composer("train") as compose:
         default = checked_config(compose([f"ablation={ablation}", "setting=default"]), Train)

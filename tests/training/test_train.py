@@ -544,7 +544,12 @@ CHOICES = [
 
 
 @pytest.mark.parametrize(
-    "choice", [*CHOICES, "model=pnu_paper", "trainer.precision=bf16-mixed", "model.predict_normals=false"]
+    "choice",
+    [
+        *(pytest.param(choice, marks=pytest.mark.slow) for choice in CHOICES),
+        *("model=pnu_paper", "trainer.precision=bf16-mixed"),
+        pytest.param("model.predict_normals=false", marks=pytest.mark.slow),
+    ],
 )
 def test_every_choice_trains_a_step(train: Train, choice: str) -> None:
     run = train(choice, "trainer.max_steps=1", "trainer.max_epochs=1", "data.batch_size=2")
