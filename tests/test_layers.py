@@ -43,6 +43,7 @@ WHOLE = {
     "extras",
     "layers",
     "nightly",
+    "notebooks",
     "side_effects",
     "wheel",
 }  # tests of no room alone
