@@ -12,7 +12,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from pnu.benchmark import case_source, measure
 from pnu.geometry.normal_estimation import complete_normals
@@ -59,8 +58,8 @@ def main() -> None:
     totals: dict[str, list[np.ndarray]] = {}
     for case in case_source({"root": str(arguments.pairs)}, warn=lambda text: None).cases:
         points = case.points + arguments.noise * np.random.default_rng(0).normal(size=case.points.shape)
-        given = None if arguments.noise or case.normals is None else torch.from_numpy(case.normals)
-        cloud = np.hstack([points, complete_normals(torch.from_numpy(points), given).numpy()])
+        given = None if arguments.noise else case.normals
+        cloud = np.hstack([points, complete_normals(points, given)])
         for name, ratio in (("wlop", 1.0), ("ear", arguments.ratio)):
             count = round(ratio * len(cloud))
             for who in ("pnu", "cgal"):

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from torch import nn
 
 from pnu import metrics, reconstruction
@@ -75,7 +74,7 @@ def inputs(cases: Iterator[Case], setting: Setting, seed: int) -> Iterator[Case]
         if setting.noise:
             points = points + setting.noise * rng.standard_normal(points.shape)
         if not setting.given:
-            normals = estimate_normals(torch.from_numpy(points)[None])[0].numpy()
+            normals = estimate_normals(points)
         elif normals is None:
             raise ValueError(f"{case.truth.shape}: has no normals, which the setting '{setting.title}' needs")
         yield Case(setting.title, points, normals, case.truth)

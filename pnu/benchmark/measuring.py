@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import torch
 from torch import nn
 
 from pnu import upsamplers
@@ -92,8 +91,7 @@ def measure(
 
 def normals_of(case: Case) -> np.ndarray:
     """The normals of a case's input, or None where it has none."""
-    given = None if case.normals is None else torch.from_numpy(case.normals)
-    return complete_normals(torch.from_numpy(case.points), given).numpy()
+    return np.asarray(complete_normals(case.points, case.normals))
 
 
 def measured_network(name: str, allow: Sequence[str] = ()) -> nn.Module | str:

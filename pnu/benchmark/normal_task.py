@@ -36,17 +36,13 @@ COLUMNS = {
 def estimators(neighbors: int = 24) -> dict[str, Estimator]:
     """PCA and jets, both oriented as pnu orients; plane fits within each sheet; `pnu.normals`, learned, from there."""
 
-    def oriented(lines: Callable[[torch.Tensor], torch.Tensor]) -> Estimator:
-        def estimate(points: np.ndarray) -> np.ndarray:
-            cloud = torch.from_numpy(points)
-            return orient_normals(cloud, lines(cloud[None])[0]).numpy()
-
-        return estimate
+    def oriented(lines: Estimator) -> Estimator:
+        return lambda points: orient_normals(points, lines(points))
 
     return {
-        "pca": oriented(lambda cloud: estimate_normals(cloud, neighbors, orient=False)),
-        "jets": oriented(lambda cloud: jet_normals(cloud, neighbors)),
-        "planes": lambda points: estimate_normals(torch.from_numpy(points)[None])[0].numpy(),
+        "pca": oriented(lambda points: estimate_normals(points, neighbors, orient=False)),
+        "jets": oriented(lambda points: jet_normals(torch.from_numpy(points)[None], neighbors)[0].numpy()),
+        "planes": estimate_normals,
         "pnu": normals,
     }
 
@@ -70,8 +66,8 @@ def network_estimator(network: nn.Module, name: str, at_once: int = 512) -> Esti
                 found(torch.from_numpy(points[idx] - points[idx[:, :1]]).float()[None])[0, :, 3:].double()
                 for idx in np.array_split(near, -(-len(near) // at_once))
             ]
-        lines = torch.nn.functional.normalize(torch.cat(rows), dim=1)
-        return (lines if found.oriented else orient_normals(torch.from_numpy(points), lines)).numpy()
+        lines: np.ndarray = torch.nn.functional.normalize(torch.cat(rows), dim=1).numpy()
+        return lines if found.oriented else orient_normals(points, lines)
 
     return estimate
 

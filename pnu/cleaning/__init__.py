@@ -3,7 +3,6 @@
 from typing import Literal, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from pnu.cleaning.outliers import MANY, stray_points
@@ -73,4 +72,4 @@ def clean_cloud(
 
 def is_quiet(points: NDArray[np.float64]) -> bool:
     """Whether the noise of points (n, 3) is less than 0.45 of their spacing: more of it looks like strays too."""
-    return noise_level(torch.from_numpy(points)) < NOISY * spacing(points)
+    return noise_level(points) < NOISY * spacing(points)

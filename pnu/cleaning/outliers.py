@@ -4,14 +4,12 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
+from pnu.geometry.connected_parts import connected_parts
 from pnu.geometry.outlier_features import outlier_features
 from pnu.geometry.point_tree import PointTree
-from pnu.networks.outlier_detector import OutlierDetector
+from pnu.runtime.threads import thread_count
 
 WEIGHTS = Path(__file__).with_name("outliers.safetensors")
 SURE = 3.0  # logarithm of the odds from which on a point is taken for stray,
@@ -29,14 +27,22 @@ FEWEST = 64  # points of a cloud in which strays can be told
 
 
 @cache
-def detector() -> OutlierDetector:
-    """The network that comes with pnu."""
-    from safetensors.torch import load_file
+def detector_weights() -> dict[str, NDArray[np.float32]]:
+    """Those of the `pnu.networks.outlier_detector.OutlierDetector` that comes with pnu, by their names."""
+    from safetensors.numpy import load_file
 
-    with torch.random.fork_rng(devices=[]):  # the numbers drawn for weights that are read anyway
-        network = OutlierDetector()
-    network.load_state_dict(load_file(WEIGHTS))
-    return network.eval()
+    return load_file(WEIGHTS)
+
+
+def stray_odds(features: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Logarithm of the odds that each point is stray, (n,), of features (n, 52): what the detector computes."""
+    weights = detector_weights()
+    values = (features - weights["mean"]) / weights["deviation"]
+    for layer in (0, 2, 4):
+        values = values @ weights[f"layers.{layer}.weight"].T + weights[f"layers.{layer}.bias"]
+        if layer < 4:
+            np.maximum(values, 0, out=values)
+    return values[:, 0]
 
 
 def stray_points(points: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -49,8 +55,7 @@ def stray_points(points: NDArray[np.float64]) -> NDArray[np.bool_]:
         rows = np.flatnonzero(stays)
         if len(rows) < FEWEST:
             break
-        with torch.inference_mode():
-            odds = detector()(torch.from_numpy(outlier_features(points[rows]))).numpy()
+        odds = stray_odds(outlier_features(points[rows]))
         if (odds > SURE).mean() > MANY:
             enough = LIKELY
         stray = (odds > enough) & ~fit_in_order(points[rows])
@@ -70,7 +75,7 @@ def continue_surface(points: NDArray[np.float64], others: NDArray[np.float64]) -
 
     Where a cloud thins out the detector takes its last points for stray; they are none.
     """
-    tree, count = PointTree(others), torch.get_num_threads()
+    tree, count = PointTree(others), thread_count()
     distance, near = tree.nearest(points, AROUND, threads=count)
     some = near[:, : AROUND // 2]
     spacing = tree.nearest(others[some].reshape(-1, 3), 7, threads=count)[0][:, 1:].reshape(*some.shape, 6).mean((1, 2))
@@ -88,7 +93,7 @@ def fit_in_order(points: NDArray[np.float64]) -> NDArray[np.bool_]:
 
     On tips and rods the points of such a cloud stand alone, but in order; what measures nothing would lie anyhow.
     """
-    distance, near = PointTree(points).nearest(points, 9, threads=torch.get_num_threads())
+    distance, near = PointTree(points).nearest(points, 9, threads=thread_count())
     apart = distance[:, 1]
     narrow, usual, wide = np.quantile(apart, (0.1, 0.5, 0.9))
     if wide - narrow >= EVEN * usual:
@@ -101,11 +106,10 @@ def fit_in_order(points: NDArray[np.float64]) -> NDArray[np.bool_]:
 def small_pieces(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which of the points (n, 3) belong to a piece of fewer than 12 that stands apart from all others, (n,)."""
     k = min(PIECE, len(points) - 1)
-    distance, near = PointTree(points).among_themselves(k + 1, threads=torch.get_num_threads())
+    distance, near = PointTree(points).among_themselves(k + 1, threads=thread_count())
     reach = APART * np.median(distance[near, min(5, k - 1)], 1)
     linked = distance <= np.maximum(reach[:, None], reach[near])
     first = np.broadcast_to(np.arange(len(points))[:, None], near.shape)[linked]
-    graph = coo_matrix((np.ones(len(first), bool), (first, near[linked])), (len(points), len(points)))
-    piece = connected_components(graph, directed=False)[1]
+    piece = connected_parts(first, near[linked], len(points))
     small: NDArray[np.bool_] = (np.bincount(piece) < PIECE)[piece]
     return small

@@ -122,9 +122,9 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
                     text = help_text(schema, quoting.program(name), checked(spelled, schema, compose, complete=False))
                     print(text)
                     return
-                from pnu.training import optuna_search, sweeps
-
-                if not parsed.multirun:
+                if parsed.multirun:
+                    from pnu.training import optuna_search, sweeps
+                else:
                     check_single(overrides)
                 if goes_on:
                     added = sweeps.sweep_arguments(overrides, name)
@@ -228,8 +228,6 @@ def folder_arguments(config: Any, schema: type) -> list[str]:
     Raises:
         ValueError: `run` names another folder, or the command makes none.
     """
-    from pnu.training.run_folder import is_main_process
-
     given, changes = config.hydra.run.dir, config.hydra.job.chdir
     if changes and given == "." and "trainer" in fields(schema):
         if config.run is None:
@@ -238,7 +236,11 @@ def folder_arguments(config: Any, schema: type) -> list[str]:
             )
         path = Path(config.run).absolute()
         return [quoting.override("hydra.run.dir", path), quoting.override("run", path)]
-    if given == "." or not is_main_process():  # Lightning gives the other processes of a training one of their own
+    if given == ".":
+        return []
+    from pnu.training.run_folder import is_main_process
+
+    if not is_main_process():  # Lightning gives the other processes of a training one of their own
         return []
     if "trainer" not in fields(schema):
         if changes:

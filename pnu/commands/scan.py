@@ -61,12 +61,10 @@ def scan(cfg: Any) -> None:
     origin = "with normals" if before.normals is not None else "without normals"
     say(f"scan:   {cfg.input}, {len(before.points)} points, {origin}")
 
-    import torch
-
     from pnu import reconstruction
     from pnu.geometry.cloud_statistics import describe_cloud
-    from pnu.networks import checkpoints
     from pnu.upsamplers import whole_clouds
+    from pnu.upsamplers.inference import LoadedWeights, is_cpu
 
     wanted = cfg.ratio if cfg.spacing is None else whole_clouds.ratio_of_spacing(before.points, cfg.spacing)
     count = whole_clouds.output_count(len(before.points), wanted)
@@ -77,10 +75,10 @@ def scan(cfg: Any) -> None:
     if cfg.removed is not None:
         gone = {name: values[stray] for name, values in before.attributes.items()}
         io.write_cloud(cfg.removed, before.points[stray], None, gone)
-    network = checkpoints.load(whole_clouds.weights_source("surface", own, scanned))
+    network = LoadedWeights("surface").network(own, scanned)
     for name, value in QUALITIES[cfg.quality].items():
         setattr(network, name, value)
-    device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = "cpu" if is_cpu("auto") else "cuda"
     with stages(cfg.quiet) as progress:
         dense = whole_clouds.upsample(
             cloud.points, cloud.normals, ratio=count / len(cloud.points), outliers="keep", lines="keep", signs="keep",

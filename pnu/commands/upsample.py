@@ -98,7 +98,9 @@ def upsample(cfg: Any) -> None:
     from pnu.geometry.cloud_statistics import describe_cloud
     from pnu.networks import checkpoints
     from pnu.networks.checkpoints import NEWEST
-    from pnu.upsamplers import CLASSICAL, whole_clouds
+    from pnu.upsamplers import whole_clouds
+    from pnu.upsamplers.inference import weights_source
+    from pnu.upsamplers.selection import CLASSICAL
 
     wanted = cfg.ratio if cfg.spacing is None else whole_clouds.ratio_of_spacing(cloud.points, cfg.spacing)
     count, before = whole_clouds.output_count(len(cloud.points), wanted), cloud
@@ -117,7 +119,7 @@ def upsample(cfg: Any) -> None:
     say(f"        {look}")
     for text in look.warnings():
         say(f"        {text}")
-    run = whole_clouds.weights_source(cfg.run, own, scanned)
+    run = weights_source(cfg.run, own, scanned)
     chosen = (
         " (the newest finished one)"
         if cfg.run == NEWEST

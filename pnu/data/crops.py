@@ -10,9 +10,9 @@ from torch.utils.data import Dataset
 
 from pnu.data.scanner import Scanner, any_scan
 from pnu.geometry.anisotropy import averaged, thinned_lines
+from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.mesh_sampling import sample_area, sample_poisson_disk
 from pnu.geometry.normal_estimation import estimate_normals, refit_normals
-from pnu.geometry.sampling import farthest_points_large
 from pnu.io import Mesh
 
 LEAST, MOST = 600, 8000  # points of a cloud, evenly spread in the logarithm, for half of the clouds
@@ -143,10 +143,9 @@ class Crops(Dataset[dict[str, Any]]):
 
 def rough_normals(points: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Normals as `estimate_normals` finds them from points (n, 3), had it known the sides: those of `true` (n, 3)."""
-    cloud, side = torch.from_numpy(points), torch.from_numpy(true)
-    planes = estimate_normals(cloud[None], orient=False)[0]
-    planes = torch.where((planes * side).sum(1, keepdim=True) < 0, -planes, planes)
-    return refit_normals(cloud, planes).numpy()
+    planes = estimate_normals(points, orient=False)
+    planes = np.where((planes * true).sum(1, keepdims=True) < 0, -planes, planes)
+    return refit_normals(points, planes)
 
 
 def uneven(cloud: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:

@@ -17,9 +17,9 @@ from scipy.spatial import cKDTree
 
 from pnu.data.shapes import unit_mesh
 from pnu.extras import needed
+from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.mesh_sampling import sample_area
 from pnu.geometry.mesh_topology import open_edges
-from pnu.geometry.sampling import farthest_points_large
 from pnu.geometry.sharp_edges import sharp_edge_points
 from pnu.io import Mesh, atomic_path
 

@@ -1,20 +1,11 @@
-"""The surface model's step for whole batches by compiled kernels, where they can stand for it."""
+"""The surface model's step for whole batches by compiled kernels, where they can stand for a network of torch."""
 
-from collections.abc import Callable
-
-import numpy as np
 import torch
 from torch import Tensor
 
 from pnu import kernels
+from pnu.networks.compiled_surface import Project, compiled_feet, compiled_step, is_known
 from pnu.networks.surface import Projector, Surface
-
-Project = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""project(queries (m, 6), cloud (n, 6), their neighbors idx (m, k)) -> (m, 7): points, unit normals, logarithm of the
-expected error; the first two in float64."""
-
-LAYERS = ("first", "second", "context", "third", "head.0", "head.2", "out")
-PARAMETERS = {f"{layer}.{part}" for layer in LAYERS for part in ("weight", "bias")} | {"attention.weight"}
 
 
 def compiled_projection(network: Surface) -> Project | None:
@@ -24,38 +15,16 @@ def compiled_projection(network: Surface) -> Project | None:
     """
     projector = network.projector
     known = type(network).project is Surface.project and type(projector) is Projector
-    if not (known and _compiled(projector.out.weight) and set(projector.state_dict()) == PARAMETERS):
+    if not (known and _compiled(projector.out.weight) and is_known(projector.state_dict())):
         return None
-    from pnu.kernels.projector import packed, project_queries
-
     parameters = {name: value.numpy() for name, value in projector.state_dict().items()}
-    weights = packed(parameters, attention=projector.attend)
-
-    def work(query: Tensor, cloud: Tensor, idx: Tensor) -> Tensor:
-        result = np.empty((len(query), 7))
-        project_queries(*_arrays(query, cloud, idx), projector.sphere, *weights, result)
-        return torch.from_numpy(result).to(query.dtype)
-
-    return work
+    return compiled_step(parameters, sphere=projector.sphere, attention=projector.attend)
 
 
 def compiled_spheres(like: Tensor) -> Project | None:
-    """Steps to the sphere that fits the neighbors (`local_frames.feet`) in the type of a tensor, and zeros."""
-    if not _compiled(like):
-        return None
-    from pnu.kernels.frames import project_to_spheres
-
-    def work(query: Tensor, cloud: Tensor, idx: Tensor) -> Tensor:
-        result = np.zeros((len(query), 7))
-        project_to_spheres(*_arrays(query, cloud, idx), result[:, :6])
-        return torch.from_numpy(result).to(query.dtype)
-
-    return work
+    """Steps to the sphere that fits the neighbors, where those of a tensor's type and place are compiled."""
+    return compiled_feet if _compiled(like) else None
 
 
 def _compiled(like: Tensor) -> bool:
     return like.device.type == "cpu" and like.dtype == torch.float32 and kernels.ready()
-
-
-def _arrays(query: Tensor, cloud: Tensor, idx: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return query.double().contiguous().numpy(), cloud.double().contiguous().numpy(), idx.contiguous().numpy()

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.point_tree import PointTree
-from pnu.geometry.sampling import farthest_points_large
 
 AROUND = 8  # neighbors whose spread is looked at
 PLACES = 2000

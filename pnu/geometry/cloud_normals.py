@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
-import torch
 
 from pnu.geometry.cloud_statistics import CONTRADICTING, contradicting
 from pnu.geometry.flipped_parts import flipped_share
@@ -16,7 +15,7 @@ from pnu.io.sensor import Sight
 from pnu.runtime.progress import Progress, silent
 
 Choice = Literal["auto", "estimate", "orient", "keep"]
-Refine = Callable[[torch.Tensor, torch.Tensor, Progress], torch.Tensor]
+Refine = Callable[[np.ndarray, np.ndarray, Progress], np.ndarray]
 """points (n, 3) in the unit sphere, rough normals (n, 3) whose sides agree -> better ones (n, 3)."""
 OUTWARD = "outward, by the winding field"
 UP = np.array([0.0, 0.0, 1.0])
@@ -57,34 +56,37 @@ def settled_normals(
         ValueError: all points lie on a line.
     """
     order = np.lexsort(points.T)
-    cloud = torch.from_numpy(points[order])[None]
-    frame = unit_sphere_frame(cloud)
-    unit = frame.to_unit(cloud)[0]
+    frame = unit_sphere_frame(points[order])
+    unit = frame.to_unit(points[order])
     given = None if normals is None or choice == "estimate" else normals[order]
     known = np.zeros(len(points), bool) if given is None else np.isfinite(given).all(1)
-    why = contradiction(unit.numpy(), given) if choice == "auto" and given is not None else ""
+    why = contradiction(unit, given) if choice == "auto" and given is not None else ""
     anew = ~known | (choice == "orient") | (choice == "auto" and (asked is not None or bool(why)))
     if given is not None and not anew.any():
         return Settled(np.array(normals, np.float64), _words(known, 0, "", ""), "")
-    extent = torch.linalg.svdvals(unit - unit.mean(0))
-    if extent[1] < 1e-9 * extent[0]:
-        raise ValueError(f"points: all {len(points)} points lie on a line; expected points on a surface")
+    check_not_a_line(unit)
     progress("normals", 0, 1)
-    lines = complete_normals(unit, None if given is None else torch.from_numpy(given), neighbors)
+    lines = complete_normals(unit, given, neighbors)
     if refine is not None and not known.all():
-        missing = torch.from_numpy(~known)[:, None]
-        lines = torch.where(missing, refine(unit, lines, progress), lines)
+        lines = np.where(known[:, None], lines, refine(unit, lines, progress))
     sight = asked or found or (Sight("up, as a map of heights", up=UP) if is_height_map(points) else None)
     if sight is not None and sight.viewpoint is not None:
-        center, scale = frame.center[0, 0].numpy(), float(frame.scale)
+        center, scale = frame.center[0], frame.scale.item()
         places = sight.viewpoint[order] if sight.viewpoint.ndim == 2 else sight.viewpoint
         sight = sight._replace(viewpoint=(places - center) / scale)
     sign, side = _signs(unit, lines, known, anew, sight, repair=bool(why))
     progress("normals", 1, 1)
     sign = np.where(anew, sign, 1)
     settled = np.empty(points.shape)
-    settled[order] = lines.numpy() * sign[:, None]
+    settled[order] = lines * sign[:, None]
     return Settled(settled, _words(known, int((sign[known] < 0).sum()), why, side), side)
+
+
+def check_not_a_line(points: np.ndarray) -> None:
+    """`ValueError` where all points (n, 3) lie on a line."""
+    extent = np.linalg.svd(points - points.mean(0), compute_uv=False)
+    if extent[1] < 1e-9 * extent[0]:
+        raise ValueError(f"points: all {len(points)} points lie on a line; expected points on a surface")
 
 
 def contradiction(points: np.ndarray, normals: np.ndarray) -> str:
@@ -109,22 +111,22 @@ def is_height_map(points: np.ndarray) -> bool:
 
 
 def _signs(
-    unit: torch.Tensor, lines: torch.Tensor, known: np.ndarray, anew: np.ndarray, sight: Sight | None, *, repair: bool
+    unit: np.ndarray, lines: np.ndarray, known: np.ndarray, anew: np.ndarray, sight: Sight | None, *, repair: bool
 ) -> tuple[np.ndarray, str]:
     """A sign for each line, and what decided those that are anew."""
     same = np.ones(len(known))
     if sight is not None and sight.inward is None:
-        return seen_signs(unit.numpy(), lines.numpy(), viewpoint=sight.viewpoint, up=sight.up), sight.words
+        return seen_signs(unit, lines, viewpoint=sight.viewpoint, up=sight.up), sight.words
     if sight is None and known.any() and not anew[known].any():
         return same, "as the nearest given"
     if sight is None and repair:
-        sign, by = repaired_signs(unit.numpy(), lines.numpy())
+        sign, by = repaired_signs(unit, lines)
         return sign, OUTWARD if by == "outward" else "that of most given"
     oriented = orient_normals(unit, lines) if known.any() else lines
-    sign = np.where((oriented * lines).sum(1).numpy() < 0, -1.0, 1.0)
+    sign = np.where((oriented * lines).sum(1) < 0, -1.0, 1.0)
     if sight is not None:
         return (-sign if sight.inward else sign), sight.words
-    closed = is_closed(NeighborCloud.of(unit), oriented.float())
+    closed = is_closed(NeighborCloud.of(unit), oriented.astype(np.float32))
     return sign, OUTWARD if closed else "one and the same over an open surface"
 
 

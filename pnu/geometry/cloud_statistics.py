@@ -3,11 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from scipy.spatial import cKDTree
 
 from pnu.geometry.flipped_parts import flipped_share
 from pnu.geometry.noise_level import noise_level
+from pnu.geometry.point_tree import PointTree
 
 NEIGHBORS = 8
 PLACES = 4000
@@ -66,10 +65,10 @@ class CloudStatistics(NamedTuple):
 def describe_cloud(points: np.ndarray, normals: np.ndarray | None = None) -> CloudStatistics:
     """Spacing and noise of a cloud (n, 3), n >= 16; normals (n, 3) tell the sides of thin walls apart."""
     k = min(NEIGHBORS, len(points) - 1)
-    far = cKDTree(points).query(points[:: -(-len(points) // PLACES)], k=[k + 1])[0]
+    far = PointTree(points).nearest(points[:: -(-len(points) // PLACES)], k + 1)[0][:, k]
     dense, middle, sparse = (float(value) for value in np.quantile(far * np.sqrt(np.pi / k), (0.1, 0.5, 0.9)))
     units = None if normals is None else normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    noise = noise_level(torch.from_numpy(points), None if units is None else torch.from_numpy(units))
+    noise = noise_level(points, units)
     center = (points.min(0) + points.max(0)) / 2
     radius = float(np.linalg.norm(points - center, axis=1).max())
     against, flipped = (0.0, 0.0) if units is None else (contradicting(points, units), flipped_share(points, units))
@@ -84,7 +83,7 @@ def contradicting(points: np.ndarray, normals: np.ndarray) -> float:
     towards each other as often: so twice those that look towards each other are counted, and no more than all.
     """
     here = np.arange(len(points))[:: -(-len(points) // PLACES)]
-    near = cKDTree(points).query(points[here], k=min(7, len(points)))[1][:, 1:]
+    near = PointTree(points).nearest(points[here], min(7, len(points)))[1][:, 1:]
     step = points[near] - points[here, None]
     length = np.linalg.norm(step, axis=2)
     first, second = normals[here, None], normals[near]
@@ -103,6 +102,6 @@ def far_points(points: np.ndarray) -> tuple[int, int]:
     rows = np.flatnonzero(distance > (1 + FAR) * reach)
     if not len(rows):
         return 0, int(distance.argmax())
-    alone = cKDTree(points).query(points[rows], k=[min(5, len(points))])[0][:, 0] > FAR * reach
+    alone = PointTree(points).nearest(points[rows], min(5, len(points)))[0][:, -1] > FAR * reach
     rows = rows[alone]
     return len(rows), int(rows[distance[rows].argmax()]) if len(rows) else int(distance.argmax())

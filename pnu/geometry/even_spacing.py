@@ -1,22 +1,35 @@
 """Spread points over a surface that is known by points and normals: seeds between the points, even spacing."""
 
 import math
+from typing import Any
 
-import torch
-from torch import Tensor
-from torch.nn.functional import normalize
+import numpy as np
+from numpy.typing import NDArray
 
-from pnu.geometry.local_frames import tangent_basis
-from pnu.geometry.neighbor_search import Search, knn
+from pnu import kernels
+from pnu.geometry.point_tree import PointTree
 from pnu.geometry.spatial_blocks import along_curve
 from pnu.runtime.progress import Step, silent
+from pnu.runtime.threads import map_on_threads, thread_count
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
-ROWS = 2**18  # points whose neighbors are gathered at once: bounds the memory
+ROWS = 2**18  # points whose neighbors are gathered at once: bounds the memory,
+CHUNK = 2**11  # or so many by a thread
 RANK = 12  # of the neighbor that a disc of seeds reaches
+AROUND = 8  # neighbors push a point
+USUAL = 6  # neighbors whose mean distance tells how far apart points lie,
+REACH = 1.25  # and so many of these distances points push each other
+FACING = -0.2  # cosine of normals from which on they do
+LONGEST = 0.3  # reaches that a point moves at once, at most
+LEAST = 1e-150  # reach, where all points lie at one place
+
+Floats = NDArray[np.float64]
 
 
-def tangent_discs(points: Tensor, normals: Tensor, count: int, *, rank: int = RANK, first: int | None = None) -> Tensor:
+def tangent_discs(
+    points: NDArray[np.floating], normals: NDArray[np.floating], count: int, *, rank: int = RANK,
+    first: int | None = None,
+) -> NDArray[np.floating]:  # fmt: skip
     """Seeds on a disc around each point in its tangent plane, as wide as the rank-th neighbor is far.
 
     points, normals (n, 3) -> (n, count, 3), or (first, count, 3) around the first points alone. Evenly spread by area
@@ -24,39 +37,31 @@ def tangent_discs(points: Tensor, normals: Tensor, count: int, *, rank: int = RA
     random, and seeds turn and grow with the cloud. The discs overlap, so that seeds also lie in holes between points.
     """
     rank = min(rank, len(points) - 1)
-    cloud = points
-    points, normals = points[:first], normals[:first]
-    found = knn(points[None], cloud[None], rank + 1)
-    radius = found.dist_sq[0, :, -1:].sqrt()
-    toward = cloud[found.idx[0, :, 1]] - points
-    along = toward - (toward * normals).sum(-1, keepdim=True) * normals
-    short = along.norm(dim=-1, keepdim=True) <= 1e-6 * radius
-    along = normalize(torch.where(short, tangent_basis(normals)[0], along), dim=-1)
-    across = torch.linalg.cross(normals, along)
-    seed = torch.arange(count, device=points.device, dtype=points.dtype)
-    discs = points.new_empty(len(points), count, 3)
-    for part in torch.split(torch.arange(len(points), device=points.device), max(ROWS // count, 1)):
-        point = part[:, None].to(points.dtype)
-        share = (seed + (point * (1 / GOLDEN_ANGLE)).frac()) / count
-        angle = GOLDEN_ANGLE * (seed + count * point)
-        r = radius[part] * share.sqrt()
-        discs[part] = (
-            points[part, None]
-            + (r * angle.cos())[..., None] * along[part, None]
-            + (r * angle.sin())[..., None] * across[part, None]
-        )
+    kind: Any = points.dtype
+    cloud, points, normals = points, points[:first], normals[:first]
+    distance, idx = PointTree(cloud).nearest(points, rank + 1, threads=thread_count())
+    radius = distance[:, -1:].astype(kind)
+    toward = cloud[idx[:, 1]] - points
+    along = toward - (toward * normals).sum(-1, keepdims=True) * normals
+    short = np.linalg.norm(along, axis=-1, keepdims=True) <= 1e-6 * radius
+    along = _unit(np.where(short, _perpendicular(normals), along))
+    across = np.cross(normals, along)
+    seed = np.arange(count, dtype=kind)
+    discs = np.empty((len(points), count, 3), kind)
+    rows = max(ROWS // count, 1)
+    for start in range(0, len(points), rows):
+        part = slice(start, start + rows)
+        point = np.arange(start, min(start + rows, len(points)), dtype=kind)[:, None]
+        share = (seed + (point * kind.type(1 / GOLDEN_ANGLE)) % 1) / count
+        angle = kind.type(GOLDEN_ANGLE) * (seed + count * point)
+        r = radius[part] * np.sqrt(share)
+        discs[part] = points[part, None]
+        discs[part] += (r * np.cos(angle))[..., None] * along[part, None]
+        discs[part] += (r * np.sin(angle))[..., None] * across[part, None]
     return discs
 
 
-def repel(
-    points: Tensor,
-    normals: Tensor,
-    *,
-    steps: int,
-    neighbors: int = 8,
-    step: Step = silent,
-    movable: int | None = None,
-) -> Tensor:
+def repel(points: Floats, normals: Floats, *, steps: int, step: Step = silent, movable: int | None = None) -> Floats:
     """Even out the spacing: points (m, 3) push neighbors apart in their tangent planes, `steps` times.
 
     Only the first `movable` move, all by default.
@@ -64,33 +69,64 @@ def repel(
     Points push each other with a force that falls to zero at about the distance that evenly spread points have, so
     a cloud does not grow beyond its border. Points of sheets that look opposite ways ignore each other.
     """
-    m, k = len(points), min(neighbors + 1, len(points))
-    parts = torch.split(torch.arange(m, device=points.device), ROWS)
-    dist, idx = points.new_empty(m, k - 1), torch.empty(m, k - 1, dtype=torch.int32, device=points.device)
-    done, total = 0, steps * len(parts)
+    m, k = len(points), min(AROUND + 1, len(points))
+    done, total = 0, steps * -(-m // ROWS)
     step(0, total)
+    if m < 2:
+        step(total, total)
+        return points.copy()
     order = along_curve(points)
-    points, normals = points[order], normals[order]
-    free = (order < (m if movable is None else movable))[:, None].to(points)
+    points, normals = points[order], np.ascontiguousarray(normals[order])
+    fixed = order >= (m if movable is None else movable)
+    distance, near = np.empty((m, k - 1)), np.empty((m, k - 1), np.int64)
     for _ in range(steps):
-        search = Search(points)
-        for part in parts:
-            found = search.knn(points[part], k, ordered=True)
-            dist[part], idx[part] = found.dist_sq[:, 1:].sqrt(), found.idx[:, 1:].int()
+        tree = PointTree(points)
+        for start in range(0, m, ROWS):
+            part = slice(start, start + ROWS)
+            dist_sq, idx = tree.nearest_sq(points[part], k, threads=thread_count(), ordered=True)
+            distance[part], near[part] = np.sqrt(dist_sq[:, 1:]), idx[:, 1:]
             done += 1
             step(done, total)
-        radius = 1.25 * dist[:, :6].mean(1).median()
-        moved = []
-        for part in parts:
-            near = idx[part].long()
-            away = points[part, None] - points[near]
-            alike = (normals[part, None] * normals[near]).sum(-1) > -0.2
-            force = (1 - dist[part] / radius).clamp(min=0) * alike / dist[part].clamp(min=1e-9 * radius)
-            push = 0.5 * radius * (force[..., None] * away).sum(1)
-            push = push - (push * normals[part]).sum(-1, keepdim=True) * normals[part]
-            push = push * free[part]
-            moved.append(points[part] + push * (0.3 * radius / push.norm(dim=-1, keepdim=True).clamp(min=0.3 * radius)))
-        points = torch.cat(moved)
-    back = torch.empty_like(points)
+        usual = distance[:, :USUAL].mean(1)
+        reach = np.full(m, REACH * np.quantile(usual, 0.5, method="lower"))
+        moved = pushed_apart(points, normals, near, distance, reach)
+        moved[fixed] = points[fixed]
+        points = moved
+    back = np.empty_like(points)
     back[order] = points
     return back
+
+
+def pushed_apart(points: Floats, normals: Floats, near: NDArray[np.int64], distance: Floats, reach: Floats) -> Floats:
+    """Where the first r of points (m, 3) go when their neighbors near (r, k), at a distance (r, k), push them in their
+    tangent planes, each within its reach (r,): (r, 3)."""
+    moved, reach = np.empty((len(near), 3)), np.maximum(reach, LEAST)
+    parts = [slice(start, start + CHUNK) for start in range(0, len(near), CHUNK)]
+    if kernels.ready():
+        from pnu.kernels.pushes import push_apart
+
+        arrays = [np.ascontiguousarray(values) for values in (points, normals, near, distance, reach)]
+        map_on_threads(lambda part: push_apart(*arrays, part.start, moved[part]), parts)
+        return moved
+    for part in parts:
+        here, idx, far = slice(part.start, min(part.stop, len(near))), near[part], reach[part, None]
+        away = points[here, None] - points[idx]
+        facing = (normals[here, None] * normals[idx]).sum(-1) > FACING
+        force = np.maximum(1 - distance[part] / far, 0) * facing / np.maximum(distance[part], 1e-9 * far)
+        push = 0.5 * far * (force[..., None] * away).sum(1)
+        push -= (push * normals[here]).sum(-1, keepdims=True) * normals[here]
+        longest = LONGEST * far
+        moved[part] = points[here] + push * (longest / np.maximum(np.linalg.norm(push, axis=1, keepdims=True), longest))
+    return moved
+
+
+def _unit(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
+    found: NDArray[np.floating] = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+    return found
+
+
+def _perpendicular(normals: NDArray[np.floating]) -> NDArray[np.floating]:
+    """A unit vector across each unit normal (n, 3), the first of `pnu.geometry.local_frames.tangent_basis`."""
+    aside = np.zeros_like(normals)
+    np.put_along_axis(aside, np.abs(normals).argmin(1)[:, None], 1, 1)
+    return _unit(np.cross(normals, aside))

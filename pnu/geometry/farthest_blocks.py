@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from pnu.geometry.point_tree import PointTree
 from pnu.geometry.spatial_blocks import Blocks, Index, split_blocks
 from pnu.runtime.progress import Step, silent
 
@@ -126,8 +126,7 @@ def _choose_all(
         halo = blocks.halo(xyz, number, margin)
         free = np.concatenate([own, halo[waiting[halo]]])
         if len(fixed):
-            tree = cKDTree(xyz[fixed])
-            free = free[tree.query(xyz[free], distance_upper_bound=reach)[0] >= reach]
+            free = free[PointTree(xyz[fixed]).nearest(xyz[free], 1)[0][:, 0] >= reach]
         both = np.concatenate([fixed, free])
         if not len(free):
             return none, np.empty(0)
@@ -166,7 +165,7 @@ def _choose_all(
         taken = np.concatenate(around)
         if not len(free) or not len(taken):
             return none, np.empty(0)
-        far = cKDTree(xyz[taken]).query(xyz[free])[0]
+        far = PointTree(xyz[taken]).nearest(xyz[free], 1)[0][:, 0]
         added, distances = [none], [np.empty(0)]
         while (far >= reach).any() and far.max() > 0:
             farthest = far.argmax()
@@ -182,18 +181,19 @@ def _choose_all(
     return np.concatenate(chosen), np.concatenate(distance)
 
 
-def decline_of(points: NDArray[np.float32], most: int) -> Decline:
+def decline_of(points: NDArray[np.floating], most: int) -> Decline:
     """From points in the order of choice."""
     m = len(points)
     probes = np.unique(np.linspace(m // 8, m - 1, PROBES).astype(np.int64))
     k = min(PROBES, m)
-    far, idx = cKDTree(points).query(points[probes], k=np.arange(1, k + 1))
+    far, idx = PointTree(points).nearest(points[probes], k)
     before = idx < probes[:, None]
     found = before.any(1)
     if not found.any():
         return Decline(np.array([1.0]), np.array([np.inf]), most)
     distance = np.take_along_axis(far, before.argmax(1)[:, None], 1)[found, 0]
-    return Decline(probes[found] + 1.0, np.minimum.accumulate(distance), most)
+    falling = np.asarray(np.minimum.accumulate(distance), np.float64)
+    return Decline(np.asarray(probes[found] + 1.0, np.float64), falling, most)
 
 
 def _common_distance(declines: list[Decline], wanted: float) -> float:

@@ -11,9 +11,8 @@ the same side of the edge.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 
+from pnu.geometry.connected_parts import connected_parts
 from pnu.geometry.point_tree import PointTree
 
 PLACES = 10000  # points that are looked at
@@ -72,8 +71,7 @@ def parts(pairs: Pairs) -> np.ndarray:
     n = len(pairs.idx)
     quiet = np.asarray(~pairs.against.any(1))
     first, j = np.nonzero(pairs.agree & quiet[:, None] & quiet[pairs.idx])
-    graph = csr_matrix((np.ones(len(first), bool), (first, pairs.idx[first, j])), (n, n))
-    part = connected_components(graph, directed=False)[1]
+    part = connected_parts(first, pairs.idx[first, j], n)
     part = np.where(quiet & (np.bincount(part)[part] >= CORE), part, -1)
     for _ in range(3):  # the width of a border, in neighbors
         left = np.flatnonzero(part < 0)

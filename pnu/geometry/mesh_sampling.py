@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pnu.geometry.sampling import farthest_points_large
+from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.triangle_tree import closest_on_triangles
 
 if TYPE_CHECKING:

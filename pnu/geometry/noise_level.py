@@ -2,19 +2,20 @@
 
 import math
 
-import torch
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
 
-from pnu.geometry.neighbor_search import knn
-from pnu.geometry.sampling import farthest_points_large
+from pnu.geometry.farthest_sampling import farthest_points_large
+from pnu.geometry.point_tree import PointTree
+from pnu.runtime.threads import thread_count
 
 PLACES = 1000
 QUIET = 0.1  # the quietest tenth of the places: elsewhere edges and second sheets look like noise
 # neighbors, and the noise in spacings up to which they tell it apart from the spread of the points themselves
-WINDOWS = ((16, 0.22), (24, 0.4), (48, torch.inf))
+WINDOWS = ((16, 0.22), (24, 0.4), (48, math.inf))
 
 
-def noise_level(points: Tensor, normals: Tensor | None = None) -> float:
+def noise_level(points: NDArray[np.floating], normals: NDArray[np.floating] | None = None) -> float:
     """Standard deviation of the points (n, 3) across the surface, in their unit of length.
 
     Residual of quadratic fits to small neighborhoods, at the quietest tenth of a thousand places. Good to about a
@@ -22,34 +23,38 @@ def noise_level(points: Tensor, normals: Tensor | None = None) -> float:
     noise, and so do walls that are thin beside the spacing, unless `normals` (n, 3) tell their sides apart (NaN: not
     known). 0 where there are too few points to tell: fewer than 16, or hardly ten of like side around most places.
     """
-    xyz = points.detach().double()
+    xyz = np.asarray(points, np.float64)
     level = 0.0
+    if len(xyz) < WINDOWS[0][0]:
+        return level
+    places, tree = farthest_points_large(xyz, min(PLACES, len(xyz))), PointTree(xyz)
     for k, enough in WINDOWS:
         if k > len(xyz):
             break
-        places = torch.from_numpy(farthest_points_large(xyz, min(PLACES, len(xyz)))).to(xyz.device)
-        dist_sq, idx = (found[0] for found in knn(xyz[None, places], xyz[None], k))
-        weight = torch.ones_like(dist_sq)
+        distance, idx = tree.nearest(xyz[places], k, threads=thread_count())
+        weight = np.ones_like(distance)
         if normals is not None:
-            weight = (~((normals[idx] * normals[places, None]).sum(-1) <= 0.3)).double()  # NaN: no side is known
-        quietest = _residuals(xyz[idx], weight).quantile(QUIET).item()
+            with np.errstate(invalid="ignore"):  # NaN: no side is known
+                weight = (~((normals[idx] * normals[places, None]).sum(-1) <= 0.3)).astype(np.float64)
+        with np.errstate(invalid="ignore"):  # between infinite ones
+            quietest = float(np.quantile(_residuals(xyz[idx], weight), QUIET))
         if not math.isfinite(quietest):
             continue
         level = quietest
-        if level < enough * dist_sq[:, 1:6].sqrt().mean(1).median().item():
+        if level < enough * float(np.quantile(distance[:, 1:6].mean(1), 0.5, method="lower")):
             break
     return level
 
 
-def _residuals(near: Tensor, weight: Tensor) -> Tensor:
+def _residuals(near: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
     """Root mean square distance of points (m, k, 3) from their best quadratic height field, (m,), or infinity."""
     total, weight = weight.sum(1), weight[..., None]
-    near = near - (weight * near).sum(1, keepdim=True) / total[:, None, None]
-    height, u, v = (near @ torch.linalg.eigh(near.mT @ (weight * near))[1]).unbind(-1)
-    size = u.square().add(v.square()).mean(1, keepdim=True).sqrt().clamp_min(torch.finfo(near.dtype).tiny)
+    near = near - (weight * near).sum(1, keepdims=True) / total[:, None, None]
+    height, u, v = np.moveaxis(near @ np.linalg.eigh(near.swapaxes(1, 2) @ (weight * near))[1], -1, 0)
+    size = np.maximum(np.sqrt((u * u + v * v).mean(1, keepdims=True)), np.finfo(near.dtype).tiny)
     u, v = u / size, v / size
-    terms = torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v], -1)
-    normal = terms.mT @ (weight * terms) + 1e-9 * torch.eye(6, dtype=near.dtype, device=near.device)
-    fit = terms @ torch.linalg.solve(normal, (weight * terms).mT @ height[..., None])
-    square = (weight[..., 0] * (height - fit[..., 0]).square()).sum(1)
-    return torch.where(total > 9, square / (total - 6).clamp_min(1), torch.inf).sqrt()
+    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], -1)
+    normal = terms.swapaxes(1, 2) @ (weight * terms) + 1e-9 * np.eye(6)
+    fit = terms @ np.linalg.solve(normal, (weight * terms).swapaxes(1, 2) @ height[..., None])
+    square = (weight[..., 0] * (height - fit[..., 0]) ** 2).sum(1)
+    return np.sqrt(np.where(total > 9, square / np.maximum(total - 6, 1), np.inf))

@@ -15,15 +15,16 @@ a turned point are turned too says how much each speaks for its neighbors (mean 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import torch
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components, dijkstra
 
+from pnu.geometry.connected_parts import connected_parts
 from pnu.geometry.orientation import SOME_NOISE, NeighborCloud, field, is_closed, signs
 from pnu.geometry.point_tree import PointTree
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 NEIGHBORS = 12
 CLEAR = 0.5  # cosine between an axis and the way to the sensor from which on signs may start there
@@ -87,7 +88,7 @@ def voted_signs(points: np.ndarray, lines: np.ndarray, seen: np.ndarray, *, sure
     """
     pairs = Couplings.of(points, lines)
     graph = _graph(pairs, len(points), 1.01 - np.abs(pairs.coupling) + pairs.rise)
-    part = connected_components(graph, directed=False)[1]
+    part = connected_parts(pairs.first, pairs.second, len(points))
     sure = (np.abs(seen) > CLEAR) & surely
     as_given = np.where(np.bincount(part, seen)[part] < 0, -1.0, 1.0)
     followed = _followed(points, lines, seen, graph, part)
@@ -110,14 +111,14 @@ def repaired_signs(points: np.ndarray, normals: np.ndarray) -> Repair:
 
     On a closed shape outward, unless two thirds of them look inward; on open ones, piece by piece, as most do.
     """
-    cloud, given = NeighborCloud.of(torch.from_numpy(points)), torch.from_numpy(normals).float()
+    cloud, given = NeighborCloud.of(points), normals.astype(np.float32)
     sign = signs(cloud, given)
-    outward = (field(cloud, given * sign[:, None], SOME_NOISE) * given).sum(1).double().numpy()
+    outward = (field(cloud, given * sign[:, None], SOME_NOISE) * given).sum(1).astype(np.float64)
     pairs = Couplings.of(points, normals)
     found = _patchwise(pairs, outward)
-    if is_closed(cloud, given * torch.from_numpy(found).to(given)[:, None]):
+    if is_closed(cloud, given * found.astype(np.float32)[:, None]):
         return Repair(-found, "most") if (found > 0).mean() < 1 - MOST else Repair(found, "outward")
-    part = connected_components(_graph(pairs, len(points), np.ones(len(pairs.first))), directed=False)[1]
+    part = connected_parts(pairs.first, pairs.second, len(points))
     found = _turned(pairs, found, np.zeros(len(points)), part)[0]
     return Repair(np.where(np.bincount(part, found)[part] < 0, -found, found), "most")
 
@@ -130,6 +131,8 @@ def _patchwise(pairs: Couplings, outward: np.ndarray) -> np.ndarray:
     each = max(np.log(max(odds, 1 / n) / max(1 - odds, 1 / n)), 0) / NEIGHBORS
     clear = (pairs.rise < ALONG) & (np.abs(pairs.cosine) > ALIKE)
     weight = each * np.select([clear & (pairs.cosine < 0), clear], [0.0, 2.0], 1.0)  # none, where they contradict
+    from scipy.sparse import csr_matrix
+
     graph = csr_matrix((weight, (pairs.first, pairs.second)), (n, n))
     graph = graph + graph.T
     mean = np.tanh(SURE * outward)
@@ -140,6 +143,8 @@ def _patchwise(pairs: Couplings, outward: np.ndarray) -> np.ndarray:
 
 def _graph(pairs: Couplings, n: int, cost: np.ndarray) -> csr_matrix:
     """Couplings both ways, of those found twice the larger cost."""
+    from scipy.sparse import csr_matrix
+
     graph = csr_matrix((cost, (pairs.first, pairs.second)), (n, n))
     return graph.maximum(graph.T)
 
@@ -148,6 +153,8 @@ def _followed(
     points: np.ndarray, lines: np.ndarray, seen: np.ndarray, graph: csr_matrix, part: np.ndarray
 ) -> np.ndarray:
     """Signs from the clear points, and the clearest of each part, along the paths on which lines turn least."""
+    from scipy.sparse.csgraph import dijkstra
+
     start = np.abs(seen) > CLEAR
     order = np.argsort(np.abs(seen), kind="stable")
     clearest = np.zeros(part.max() + 1, np.int64)
@@ -172,7 +179,7 @@ def _turned(pairs: Couplings, sign: np.ndarray, seen: np.ndarray, part: np.ndarr
     for _ in range(TURNS):
         agree = pairs.coupling * sign[pairs.first] * sign[pairs.second]
         smooth = (np.abs(pairs.cosine) > SMOOTH) & (pairs.rise < SLOPE) & (agree > 0)
-        piece = _joined(pairs.first[smooth], pairs.second[smooth], len(sign))
+        piece = connected_parts(pairs.first[smooth], pairs.second[smooth], len(sign))
         turn = _discontent(piece, pairs, agree, seen * sign)
         if not turn.any():
             piece = _bodies(piece, pairs, agree)[piece]
@@ -182,13 +189,6 @@ def _turned(pairs: Couplings, sign: np.ndarray, seen: np.ndarray, part: np.ndarr
         sign = np.where(turn[piece], -sign, sign)
     agree = pairs.coupling * sign[pairs.first] * sign[pairs.second]
     return sign, np.bincount(part[pairs.first], agree, part.max() + 1) + np.bincount(part, SEEN * seen * sign)
-
-
-def _joined(first: np.ndarray, second: np.ndarray, n: int) -> np.ndarray:
-    """The number of the component that each of n nodes is in, (n,)."""
-    graph = csr_matrix((np.ones(len(first), bool), (first, second)), (n, n))
-    component: np.ndarray = connected_components(graph, directed=False)[1]
-    return component
 
 
 def _discontent(piece: np.ndarray, pairs: Couplings, agree: np.ndarray, heard: np.ndarray) -> np.ndarray:
@@ -213,11 +213,13 @@ def _bodies(piece: np.ndarray, pairs: Couplings, agree: np.ndarray) -> np.ndarra
     count = piece.max() + 1
     here, there = piece[pairs.first], piece[pairs.second]
     low, high = np.minimum(here, there), np.maximum(here, there)
+    from scipy.sparse import csr_matrix
+
     net = csr_matrix((agree, (low, high)), (count, count))
     all_pairs = csr_matrix((np.abs(agree), (low, high)), (count, count))
     held = (net - HELD * all_pairs).tocoo()
     firm = held.data > 0
-    return _joined(held.row[firm], held.col[firm], count)
+    return connected_parts(held.row[firm], held.col[firm], count)
 
 
 def _hidden(points: np.ndarray, lines: np.ndarray, viewpoint: np.ndarray) -> np.ndarray:

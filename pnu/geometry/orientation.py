@@ -12,19 +12,19 @@ other dipoles. Related: parametric Gauss reconstruction (Lin et al. 2022), windi
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from itertools import product
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components, dijkstra
-from torch import Tensor
 
 from pnu import kernels
-from pnu.geometry.neighbor_search import knn, nearest
-from pnu.geometry.sampling import farthest_points_large
+from pnu.geometry.farthest_sampling import farthest_points_large
+from pnu.geometry.point_tree import PointTree
 from pnu.runtime import threads
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix  # imported where it is wanted: that takes a quarter of a second
 
 ANCHORS = 4096  # points whose dipoles all see each other: 64 MiB a matrix
 ROWS = 2**16  # points treated at once in local steps,
@@ -33,36 +33,46 @@ BLOCK = 128  # rows of a matrix of all pairs, few enough for a processor's cache
 OPEN = 0.6  # relative misfit of Gauss' law; closed shapes stay below 0.5, a hemisphere too
 SOME_NOISE = 0.1  # in spacings, where it is not known
 Array = NDArray[np.float32]
+Index = NDArray[np.int64]
+f32 = np.float32
 
 
 class NeighborCloud(NamedTuple):
     """A cloud in its unit sphere, and what local steps need to know of it."""
 
-    points: Tensor  # (n, 3) float32
-    idx: Tensor  # (n, k) nearest points, itself first
-    spacing: Tensor  # (n,) usual distance to a neighbor
-    area: Tensor  # (n,) of the surface that the point stands for
+    points: Array  # (n, 3)
+    idx: Index  # (n, k) nearest points, itself first
+    spacing: Array  # (n,) usual distance to a neighbor
+    area: Array  # (n,) of the surface that the point stands for
 
     @staticmethod
-    def of(points: Tensor) -> NeighborCloud:
+    def of(points: NDArray[np.floating]) -> NeighborCloud:
         """Of points (n, 3) in any unit."""
-        points = points.detach().double()
-        points = points - points.mean(0)
-        points = (points / points.norm(dim=1).max().clamp_min(1e-30)).float()
-        few, k = min(8, len(points)), min(48, len(points))
-        dist_sq, idx = (found[0] for found in knn(points[None], points[None], k))
-        spacing = dist_sq[:, 1:6].sqrt().mean(1)[idx[:, :few]].mean(1)
-        area = (dist_sq[:, few - 1] * (torch.pi / (few - 0.5)))[idx[:, :few]].median(1).values
-        floor = (0.1 * spacing.median()).clamp_min(1e-6)  # duplicates
-        return NeighborCloud(points, idx, spacing.clamp_min(floor), area.clamp_min(floor**2))
+        centered = points.astype(np.float64)
+        centered -= centered.mean(0)
+        single = (centered / max(np.linalg.norm(centered, axis=1).max(), 1e-30)).astype(f32)
+        few, k = min(8, len(single)), min(48, len(single))
+        distance, idx = PointTree(single).nearest(single, k, threads=threads.thread_count())
+        distance = distance.astype(f32)
+        spacing = distance[:, 1:6].mean(1)[idx[:, :few]].mean(1)
+        own = distance[:, few - 1] ** 2 * f32(np.pi / (few - 0.5))
+        area = np.partition(own[idx[:, :few]], (few - 1) // 2, axis=1)[:, (few - 1) // 2]
+        floor = max(f32(0.1) * lower_median(spacing), f32(1e-6))  # duplicates
+        return NeighborCloud(single, idx, np.maximum(spacing, floor), np.maximum(area, floor * floor))
 
 
-def signs(cloud: NeighborCloud, lines: Tensor) -> Tensor:
+def lower_median(values: Array) -> f32:
+    """The middle one of values (n,), of two the lower."""
+    found: f32 = np.partition(values, (len(values) - 1) // 2)[(len(values) - 1) // 2]
+    return found
+
+
+def signs(cloud: NeighborCloud, lines: Array) -> Array:
     """+1 or -1 for each line, (n,)."""
     if len(lines) <= ANCHORS:
         sign = _global_signs(cloud, lines)
     else:
-        anchors = torch.from_numpy(farthest_points_large(cloud.points, ANCHORS)).to(lines.device)
+        anchors = farthest_points_large(cloud.points, ANCHORS)
         sign = _spread(cloud, lines, anchors, _global_signs(NeighborCloud.of(cloud.points[anchors]), lines[anchors]))
     for _ in range(3):
         turned = field(cloud, lines * sign[:, None], SOME_NOISE)
@@ -70,23 +80,24 @@ def signs(cloud: NeighborCloud, lines: Tensor) -> Tensor:
     return sign
 
 
-def is_closed(cloud: NeighborCloud, normals: Tensor) -> bool:
+def is_closed(cloud: NeighborCloud, normals: Array) -> bool:
     """Whether oriented normals (n, 3) bound something: as far as Gauss' law holds at an even subset of the points."""
     if len(normals) > ANCHORS:
-        chosen = torch.from_numpy(farthest_points_large(cloud.points, ANCHORS)).to(normals.device)
+        chosen = farthest_points_large(cloud.points, ANCHORS)
         cloud, normals = NeighborCloud.of(cloud.points[chosen]), normals[chosen]
-    weight = cloud.area.sqrt()
-    winding = _layers(cloud, normals, torch.ones_like(weight)) @ cloud.area
-    return bool(((winding.abs() - 0.5) * weight).norm() <= OPEN * (0.5 * weight).norm())
+    weight = np.sqrt(cloud.area)
+    winding = _layers(cloud, normals, np.ones_like(weight)) @ cloud.area
+    return bool(np.linalg.norm((np.abs(winding) - 0.5) * weight) <= OPEN * np.linalg.norm(0.5 * weight))
 
 
-def _global_signs(cloud: NeighborCloud, lines: Tensor) -> Tensor:
-    weight = cloud.area.sqrt()
+def _global_signs(cloud: NeighborCloud, lines: Array) -> Array:
+    weight = np.sqrt(cloud.area)
+    half = f32(0.5) * weight
     layer = _layers(cloud, lines, weight)
-    areas = _least_squares(layer, 0.5 * weight, 4)
+    areas = _least_squares(layer, half, 4)
 
-    def misfit(sign: Tensor) -> float:
-        return float((layer @ (sign * weight) - 0.5 * weight).norm() / (0.5 * weight).norm())
+    def misfit(sign: Array) -> float:
+        return float(np.linalg.norm(layer @ (sign * weight) - half) / np.linalg.norm(half))
 
     # narrow dipoles keep thin walls apart, wide ones see past noise: Gauss' law tells which did better
     sign = min((_settled(_dipoles(cloud, lines, width), _sign(areas))[0] for width in (1.0, 1.4, 2.0)), key=misfit)
@@ -96,166 +107,172 @@ def _global_signs(cloud: NeighborCloud, lines: Tensor) -> Tensor:
     return sign
 
 
-def _open_signs(cloud: NeighborCloud, lines: Tensor, areas: Tensor) -> Tensor:
+def _open_signs(cloud: NeighborCloud, lines: Array, areas: Array) -> Array:
     """Of an open sheet, where Gauss' law says little: the signs of least energy from several guesses.
 
     Guesses: the areas' signs, lines followed from point to point, and the sides seen from 13 directions.
     """
+    from scipy.sparse.csgraph import connected_components
+
     dipoles = _dipoles(cloud, lines, 1.4)
-    axes = torch.linalg.eigh(cloud.points.T @ cloud.points)[1]
-    steps = torch.cartesian_prod(*[torch.arange(-1.0, 2.0)] * 3)[14:].to(axes)
-    piece = torch.from_numpy(connected_components(_graph(cloud, lines))[1]).to(lines.device)
-    surest = torch.stack([(areas.abs() * (piece == i)).argmax() for i in range(int(piece.max()) + 1)])
+    axes = np.linalg.eigh(cloud.points.T @ cloud.points)[1]
+    steps = np.array([*product((-1, 0, 1), repeat=3)][14:], f32)
+    piece = connected_components(_graph(cloud, lines))[1]
+    surest = np.array([(np.abs(areas) * (piece == i)).argmax() for i in range(piece.max() + 1)])
     guesses = [_sign(areas), _spread(cloud, lines, surest, _sign(areas[surest]))]
     guesses += [_sign(lines @ axes @ step) for step in steps]
     return min((_settled(dipoles, guess) for guess in guesses), key=lambda found: found[1])[0]
 
 
-def _settled(dipoles: Tensor, sign: Tensor) -> tuple[Tensor, float]:
+def _settled(dipoles: Array, sign: Array) -> tuple[Array, float]:
     """Signs turned along the field of all dipoles until they agree with it, and their energy."""
     for _ in range(20):
         along = dipoles @ sign
         if bool((along * sign >= 0).all()):
             break
         sign = _sign(along)
-    return sign, -(sign @ (dipoles @ sign)).item()
+    return sign, -float(sign @ (dipoles @ sign))
 
 
-def _sign(values: Tensor) -> Tensor:
-    return torch.where(values < 0, -1.0, 1.0)
+def _sign(values: NDArray[np.floating]) -> Array:
+    return np.where(values < 0, f32(-1), f32(1))
 
 
-def _blocks(lines: Tensor) -> tuple[Tensor, ...]:
+def _blocks(lines: Array) -> list[slice]:
     """Rows of a matrix of all pairs, block by block."""
-    return torch.split(torch.arange(len(lines), device=lines.device), BLOCK)
+    return [slice(start, start + BLOCK) for start in range(0, len(lines), BLOCK)]
 
 
-def _layers(cloud: NeighborCloud, lines: Tensor, scale: Tensor) -> Tensor:
+def _layers(cloud: NeighborCloud, lines: Array, scale: Array) -> Array:
     """Winding number at each point of unit area at each point, times the factors (n,) of both: (n, n)."""
-    if _compiled(cloud):
+    if kernels.ready():
         from pnu.kernels.dipoles import winding_rows
 
         return _all_pairs(winding_rows, cloud, lines, cloud.spacing, scale)
-    return torch.cat([_layer(cloud, lines, rows) for rows in _blocks(lines)]).mul_(scale).mul_(scale[:, None])
-
-
-def _compiled(cloud: NeighborCloud) -> bool:
-    return cloud.points.device.type == "cpu" and kernels.ready()
+    matrix = np.concatenate([_layer(cloud, lines, rows) for rows in _blocks(lines)])
+    matrix *= scale
+    matrix *= scale[:, None]
+    return matrix
 
 
 def _all_pairs(
-    rows_of: Callable[[Array, int, Array], None], cloud: NeighborCloud, lines: Tensor, widths: Tensor, scale: Tensor
-) -> Tensor:
+    rows_of: Callable[[Array, int, Array], None], cloud: NeighborCloud, lines: Array, widths: Array, scale: Array
+) -> Array:
     """A matrix (n, n) whose rows a kernel computes, on all threads."""
     from pnu.kernels.dipoles import as_sources
 
-    sources = as_sources(*(values.numpy() for values in (cloud.points, lines, widths, scale)))
-    matrix = np.empty((len(lines), len(lines)), np.float32)
+    sources, matrix = as_sources(cloud.points, lines, widths, scale), np.empty((len(lines), len(lines)), f32)
     threads.map_on_threads(lambda i: rows_of(sources, i, matrix[i : i + BLOCK]), range(0, len(lines), BLOCK))
-    return torch.from_numpy(matrix)
+    return matrix
 
 
-def _layer(cloud: NeighborCloud, lines: Tensor, rows: Tensor) -> Tensor:
+def _layer(cloud: NeighborCloud, lines: Array, rows: slice) -> Array:
     """Winding number at points `rows` of unit area at each point, (r, n)."""
     points = cloud.points
     along = (points * lines).sum(1) - points[rows] @ lines.T
-    return _inverse_distances(cloud, rows, 1.0).pow_(3).mul_(along).div_(4 * torch.pi)
+    winding: Array = _inverse_distances(cloud, rows, 1.0) ** 3 * along / f32(4 * np.pi)
+    return winding
 
 
-def _dipoles(cloud: NeighborCloud, lines: Tensor, width: float) -> Tensor:
+def _dipoles(cloud: NeighborCloud, lines: Array, width: float) -> Array:
     """Field at each point, along its line, of each point's dipole, times both areas: (n, n), symmetric."""
-    if _compiled(cloud):
+    if kernels.ready():
         from pnu.kernels.dipoles import dipole_rows
 
-        return _all_pairs(dipole_rows, cloud, lines, width * cloud.spacing, cloud.area)
+        return _all_pairs(dipole_rows, cloud, lines, f32(width) * cloud.spacing, cloud.area)
     points, height = cloud.points, (cloud.points * lines).sum(1)
-    blocks = []
+    matrix = np.empty((len(lines), len(lines)), f32)
     for rows in _blocks(lines):
         inverse = _inverse_distances(cloud, rows, width)
         there, here = height - points[rows] @ lines.T, height[rows, None] - lines[rows] @ points.T
-        block = there.mul_(here).mul_(inverse).mul_(inverse).mul_(3).addmm_(lines[rows], lines.T)
-        blocks.append(block.mul_(inverse.pow_(3)).mul_(cloud.area).mul_(cloud.area[rows, None]))
-    return torch.cat(blocks).fill_diagonal_(0)
+        block = f32(3) * there * here * inverse * inverse + lines[rows] @ lines.T
+        matrix[rows] = block * inverse**3 * cloud.area * cloud.area[rows, None]
+    np.fill_diagonal(matrix, 0)
+    return matrix
 
 
-def _inverse_distances(cloud: NeighborCloud, rows: Tensor, width: float) -> Tensor:
+def _inverse_distances(cloud: NeighborCloud, rows: slice, width: float) -> Array:
     """1 / max(distance, width x spacing) of points `rows` from all, (r, n)."""
-    size, width_sq = cloud.points.square().sum(1), (width * cloud.spacing) ** 2 / 2
-    dist_sq = (size + size[rows, None]).addmm_(cloud.points[rows], cloud.points.T, alpha=-2)
-    return torch.maximum(dist_sq, width_sq + width_sq[rows, None], out=dist_sq).rsqrt_()
+    size, width_sq = (cloud.points**2).sum(1), (f32(width) * cloud.spacing) ** 2 / 2
+    dist_sq = size + size[rows, None] - f32(2) * (cloud.points[rows] @ cloud.points.T)
+    inverse: Array = 1 / np.sqrt(np.maximum(dist_sq, width_sq + width_sq[rows, None]))
+    return inverse
 
 
-def _least_squares(matrix: Tensor, target: Tensor, steps: int) -> Tensor:
+def _least_squares(matrix: Array, target: Array, steps: int) -> Array:
     """Conjugate gradients on the normal equations, stopped early: the smooth part of the solution."""
-    x, residual = torch.zeros_like(target), target
+    x, residual = np.zeros_like(target), target
     gradient = matrix.T @ residual
     direction, size = gradient, gradient @ gradient
     for _ in range(steps):
         change = matrix @ direction
-        step = size / (change @ change).clamp_min(1e-30)
+        step = size / max(change @ change, f32(1e-30))
         x, residual = x + step * direction, residual - step * change
         gradient = matrix.T @ residual
         size, before = gradient @ gradient, size
-        direction = gradient + size / before.clamp_min(1e-30) * direction
+        direction = gradient + size / max(before, f32(1e-30)) * direction
     return x
 
 
-def _graph(cloud: NeighborCloud, lines: Tensor) -> csr_matrix:
+def _graph(cloud: NeighborCloud, lines: Array) -> csr_matrix:
     """Neighbors, both ways, by how much their lines turn and how far they leave each other's tangent plane."""
+    from scipy.sparse import csr_matrix
+
     n, near = len(lines), cloud.idx[:, 1:13]
     cosine = (lines[:, None] * lines[near]).sum(-1)
     offset = cloud.points[near] - cloud.points[:, None]
-    rise = (offset * lines[:, None]).sum(-1).abs() / offset.norm(dim=-1).clamp_min(1e-12)
-    cost = (1.01 - cosine.abs() + rise).double().cpu().numpy()
-    graph = csr_matrix((cost.ravel(), near.cpu().numpy().ravel(), np.arange(n + 1) * near.shape[1]), (n, n))
+    rise = np.abs((offset * lines[:, None]).sum(-1)) / np.maximum(np.linalg.norm(offset, axis=-1), f32(1e-12))
+    cost = (f32(1.01) - np.abs(cosine) + rise).astype(np.float64)
+    graph = csr_matrix((cost.ravel(), near.ravel(), np.arange(n + 1) * near.shape[1]), (n, n))
     return graph.maximum(graph.T)
 
 
-def _spread(cloud: NeighborCloud, lines: Tensor, anchors: Tensor, sign: Tensor) -> Tensor:
+def _spread(cloud: NeighborCloud, lines: Array, anchors: Index, sign: Array) -> Array:
     """Signs of all points from those of the anchors, along paths on which the lines turn least."""
+    from scipy.sparse.csgraph import dijkstra
+
     n = len(lines)
-    source = anchors.cpu().numpy()
-    before = dijkstra(_graph(cloud, lines), indices=source, min_only=True, return_predecessors=True)[1]
+    before = dijkstra(_graph(cloud, lines), indices=anchors, min_only=True, return_predecessors=True)[1]
     alone = before < 0
-    alone[source] = False
-    parent = torch.from_numpy(np.where(before < 0, np.arange(n), before).astype(np.int64)).to(lines.device)
+    alone[anchors] = False
+    parent = np.where(before < 0, np.arange(n), before).astype(np.int64)
     if alone.any():
-        lost = torch.from_numpy(np.flatnonzero(alone)).to(lines.device)
-        parent[lost] = anchors[nearest(cloud.points[None, lost], cloud.points[None, anchors]).idx[0]]
+        parent[alone] = anchors[PointTree(cloud.points[anchors]).nearest(cloud.points[alone], 1)[1][:, 0]]
     agree = _sign((lines * lines[parent]).sum(1))
     agree[anchors] = sign
     parent[anchors] = anchors
-    rooted = torch.zeros(n, dtype=torch.bool, device=lines.device)
+    rooted = np.zeros(n, bool)
     rooted[anchors] = True
-    while not bool(rooted.all()):  # pointer doubling
-        agree = torch.where(rooted, agree, agree * agree[parent])
+    while not rooted.all():  # pointer doubling
+        agree = np.where(rooted, agree, agree * agree[parent])
         rooted, parent = rooted | rooted[parent], parent[parent]
     return agree
 
 
-def field(cloud: NeighborCloud, normals: Tensor, noise: float) -> Tensor:
+def field(cloud: NeighborCloud, normals: Array, noise: float) -> Array:
     """Minus the gradient of the neighbors' winding number at each point, as unit vectors (n, 3)."""
-    width = 1 + 3 * noise
-    if _compiled(cloud):
+    width, normals = f32(1 + 3 * noise), normals.astype(f32)
+    if kernels.ready():
         return _compiled_field(cloud, normals, width)
-    out = []
-    for rows in torch.split(torch.arange(len(normals), device=normals.device), ROWS):
+    out = np.empty_like(normals)
+    for start in range(0, len(normals), ROWS):
+        rows = slice(start, start + ROWS)
         idx = cloud.idx[rows, 1:]
         offset = cloud.points[idx] - cloud.points[rows, None]
-        width_sq = width**2 * (cloud.spacing[rows, None] ** 2 + cloud.spacing[idx] ** 2) / 2
-        dist_sq = torch.maximum(offset.square().sum(-1), width_sq)[..., None]
-        along = (normals[idx] * offset).sum(-1, keepdim=True)
-        dipoles = (normals[idx] - 3 * along / dist_sq * offset) * cloud.area[idx][..., None] / dist_sq**1.5
-        out.append(torch.nn.functional.normalize(dipoles.sum(1), dim=1))
-    return torch.cat(out)
+        width_sq = width * width * (cloud.spacing[rows, None] ** 2 + cloud.spacing[idx] ** 2) / 2
+        dist_sq = np.maximum((offset**2).sum(-1), width_sq)[..., None]
+        along = (normals[idx] * offset).sum(-1, keepdims=True)
+        dipoles = (normals[idx] - 3 * along / dist_sq * offset) * cloud.area[idx][..., None] / dist_sq ** f32(1.5)
+        total = dipoles.sum(1)
+        out[rows] = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), f32(1e-12))
+    return out
 
 
-def _compiled_field(cloud: NeighborCloud, normals: Tensor, width: float) -> Tensor:
+def _compiled_field(cloud: NeighborCloud, normals: Array, width: f32) -> Array:
     from pnu.kernels.dipoles import as_sources, neighbor_field
 
-    values = (cloud.points, normals.float(), width * cloud.spacing, cloud.area)
-    sources = np.ascontiguousarray(as_sources(*(value.numpy() for value in values)).T)
-    idx, found = cloud.idx.contiguous().numpy(), np.empty((len(normals), 3), np.float32)
+    sources = np.ascontiguousarray(as_sources(cloud.points, normals, width * cloud.spacing, cloud.area).T)
+    idx, found = np.ascontiguousarray(cloud.idx), np.empty((len(normals), 3), f32)
     parts = range(0, len(found), CHUNK)
     threads.map_on_threads(lambda i: neighbor_field(sources, idx, i, found[i : i + CHUNK]), parts)
-    return torch.from_numpy(found).to(normals)
+    return found

@@ -8,7 +8,6 @@ outlier factors (Breunig et al. 2000). All are free of place, rotation, size and
 from collections.abc import Callable
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from pnu import kernels
@@ -33,7 +32,7 @@ Indices = NDArray[np.int64]
 def outlier_features(points: NDArray[np.float64]) -> NDArray[np.float32]:
     """Features (n, 52) of points (n, 3), n >= 3. Fewer than 33 points have their farthest neighbor several times."""
     k = min(NEIGHBORS, len(points) - 1)
-    distance, near = PointTree(points).among_themselves(k + 1, threads=torch.get_num_threads())
+    distance, near = PointTree(points).among_themselves(k + 1, threads=threads.thread_count())
     if k < NEIGHBORS:
         missing = ((0, 0), (0, NEIGHBORS - k))
         distance, near = np.pad(distance, missing, mode="edge"), np.pad(near, missing, mode="edge")

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
+from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.neighbor_search import Search, nearest
-from pnu.geometry.sampling import farthest_points_large
 from pnu.runtime.progress import Step, silent
 
 
@@ -16,7 +16,7 @@ def extract(cloud: Tensor, count: int, size: int, *, cover: bool = False) -> Ten
     """
     points = cloud[:, :3].detach()
     search = Search(points)
-    centers = torch.from_numpy(farthest_points_large(points, count)).to(points.device)
+    centers = torch.from_numpy(farthest_points_large(points.cpu().numpy(), count)).to(points.device)
     found = [_around(search, centers, size)]
     if cover:
         missed = torch.ones(len(points), dtype=torch.bool, device=points.device)
@@ -38,7 +38,9 @@ def merge(patches: Tensor, n: int, step: Step = silent) -> Tensor:
     The first 3 columns are coordinates. ValueError if the patches hold fewer than n points.
     """
     cloud = patches.reshape(-1, patches.shape[-1])
-    return cloud[torch.from_numpy(farthest_points_large(cloud[:, :3], n, step=step)).to(cloud.device)]
+    return cloud[
+        torch.from_numpy(farthest_points_large(cloud[:, :3].detach().cpu().numpy(), n, step=step)).to(cloud.device)
+    ]
 
 
 def _around(search: Search, centers: Tensor, size: int) -> Tensor:

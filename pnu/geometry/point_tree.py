@@ -4,7 +4,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pnu import kernels
 
@@ -26,6 +25,8 @@ class PointTree:
 
             self.tree = NeighborTree(self.points)
         else:
+            from scipy.spatial import cKDTree
+
             self.plain = cKDTree(self.points)
 
     def nearest(

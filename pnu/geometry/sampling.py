@@ -4,18 +4,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pnu import kernels
-from pnu.geometry.farthest_blocks import farthest_in_blocks
+from pnu.geometry.farthest_sampling import check_count, farthest_order
 from pnu.geometry.neighbor_search import gpu_kernels, nearest, per_cloud
-from pnu.geometry.spatial_blocks import split_blocks
-from pnu.runtime.progress import Step, silent
 
 NEAR_ORIGIN_SQ = 1e-3  # the released code's threshold on |x|^2
-LARGE = 2**18  # points; more are sampled in blocks,
-LARGE_BLOCK: int | None = None  # of so many points, None the default of `farthest_blocks`,
-LARGE_SHARE = 64  # unless so few are wanted that blocks would hold too few of them
-BLOCKS_PAY = 2**14  # points from which on plain steps look at near blocks alone,
-NEAR_BLOCK = 2**9  # of at most so many points
 
 
 def farthest_points(points: Tensor, m: int, *, start: int | Tensor = 0, skip_near_origin: bool = False) -> Tensor:
@@ -26,7 +18,7 @@ def farthest_points(points: Tensor, m: int, *, start: int | Tensor = 0, skip_nea
     chosen as the start only, and when the others run out the first of them is repeated. ValueError if m is not in 1..n.
     """
     clouds, n, _ = points.shape
-    _check_count(m, n)
+    check_count(m, n)
     first = torch.as_tensor(start).cpu().expand(clouds)
     if bool(((first < 0) | (first >= n)).any()):
         raise ValueError(f"start: expected indices in 0..{n - 1}, found {start}")
@@ -41,41 +33,17 @@ def farthest_points(points: Tensor, m: int, *, start: int | Tensor = 0, skip_nea
     arrays, starts, out = xyz.numpy(), first.tolist(), np.empty((clouds, m), np.int64)
 
     def sample(b: int) -> None:
-        choose = _farthest_off_origin if skip_near_origin else _farthest
+        choose = _farthest_off_origin if skip_near_origin else farthest_order
         out[b] = choose(arrays[b], m, starts[b])
 
     per_cloud(sample, clouds)
     return torch.from_numpy(out)
 
 
-def farthest_points_large(points: np.ndarray | Tensor, m: int, *, step: Step = silent) -> np.ndarray:
-    """`farthest_points` from point 0 of one whole cloud (n, 3), in NumPy: idx (m,) int64, exactly m, all different.
-
-    Beyond LARGE points it works block by block (`farthest_blocks`), as evenly but from another point on, in time
-    linear in n. ValueError if m is not in 1..n.
-    """
-    xyz = points.detach().cpu() if isinstance(points, Tensor) else torch.from_numpy(np.ascontiguousarray(points))
-    _check_count(m, len(xyz))
-    array = _float32(xyz[None])[0].numpy()
-    if len(array) <= LARGE or m < len(array) // LARGE_SHARE:
-        step(0, 1)
-        chosen = _farthest(array, m, 0)
-        step(1, 1)
-        return chosen
-    return farthest_in_blocks(
-        array,
-        m,
-        lambda part, number: _farthest(part, number, 0),
-        threads=torch.get_num_threads(),
-        size=LARGE_BLOCK,
-        step=step,
-    )
-
-
 def random_points(points: Tensor, m: int, *, generator: torch.Generator) -> Tensor:
     """Uniform draw without replacement: points (B, n, 3) -> idx (B, m) int64. ValueError if m is not in 1..n."""
     clouds, n, _ = points.shape
-    _check_count(m, n)
+    check_count(m, n)
     noise = torch.rand(clouds, n, generator=generator, device=generator.device)
     return noise.topk(m, dim=1).indices.to(points.device)
 
@@ -90,7 +58,7 @@ def nonuniform_points(points: Tensor, m: int, *, strength: float, centers: int, 
     ValueError if m or centers is not in 1..n, or strength is negative.
     """
     clouds, n, _ = points.shape
-    _check_count(m, n)
+    check_count(m, n)
     if not strength >= 0:
         raise ValueError(f"strength: expected a number >= 0, found {strength}")
     if not 1 <= centers <= n:
@@ -108,27 +76,10 @@ def poisson_disk_points(points: Tensor, m: int, *, generator: torch.Generator) -
     return farthest_points(points, m, start=start)
 
 
-def _check_count(m: int, n: int) -> None:
-    if not 1 <= m <= n:
-        raise ValueError(f"m: expected 1 to {n} points (the size of the cloud), found {m}")
-
-
 def _float32(points: Tensor) -> Tensor:
     if points.dtype == torch.float64:  # map coordinates, say, lose their detail in float32
         points = points - points.mean(1, keepdim=True)
     return points.float().contiguous()
-
-
-def _farthest(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
-    """Of equal distances the lowest index, so that all three ways give the same."""
-    if not np.isfinite(xyz).all():  # as in a training that breaks, which is told elsewhere
-        with np.errstate(invalid="ignore"):
-            return _farthest_plain(xyz, m, start)
-    if kernels.ready():
-        from pnu.kernels.greedy_sampling import farthest_first
-
-        return farthest_first(xyz, m, start)
-    return (_farthest_near if len(xyz) > BLOCKS_PAY else _farthest_plain)(xyz, m, start)
 
 
 def _farthest_off_origin(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
@@ -136,50 +87,8 @@ def _farthest_off_origin(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
     refill = int(allowed.argmax())
     allowed[start] = True
     index = np.flatnonzero(allowed)
-    chosen = index[_farthest(xyz[index], min(m, len(index)), int(np.searchsorted(index, start)))]
+    chosen = index[farthest_order(xyz[index], min(m, len(index)), int(np.searchsorted(index, start)))]
     return np.concatenate([chosen, np.full(m - len(chosen), refill)])
-
-
-def _farthest_plain(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
-    axes, step = np.ascontiguousarray(xyz.T), np.empty_like(xyz.T, order="C")
-    dist_sq, chosen = np.full(len(xyz), np.inf, np.float32), np.empty(m, np.int64)
-    for i in range(m):
-        chosen[i] = start
-        np.subtract(axes, axes[:, start, None], out=step)
-        np.multiply(step, step, out=step)
-        np.minimum(dist_sq, step.sum(0), out=dist_sq)
-        dist_sq[start] = -1
-        start = int(dist_sq.argmax())
-    return chosen
-
-
-def _farthest_near(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
-    """The same with a look at those blocks alone that are nearer than their farthest point is to all chosen before."""
-    blocks = split_blocks(xyz, NEAR_BLOCK)
-    number, size = len(blocks.members), max(len(part) for part in blocks.members)
-    dist_sq, ids = np.full((number, size), -2, np.float32), np.full((number, size), len(xyz))
-    axes, home = np.zeros((number, 3, size), np.float32), np.empty((len(xyz), 2), np.int64)
-    for row, part in enumerate(blocks.members):
-        dist_sq[row, : len(part)], ids[row, : len(part)], axes[row, :, : len(part)] = np.inf, part, xyz[part].T
-        home[part, 0], home[part, 1] = row, np.arange(len(part))
-    low, high = (np.ascontiguousarray(corners.T, np.float32) for corners in (blocks.low, blocks.high))
-    best, best_id = dist_sq.max(1), ids[:, 0].copy()
-    chosen = np.empty(m, np.int64)
-    for i in range(m):
-        chosen[i] = start
-        place, own = xyz[start, :, None], home[start, 0]
-        apart = np.maximum(np.maximum(low - place, place - high), 0)
-        near = (apart * apart).sum(0) < best
-        near[own] = True
-        rows = near.nonzero()[0]
-        step = axes[rows] - place
-        part = np.minimum(dist_sq[rows], (step * step).sum(1))
-        part[np.searchsorted(rows, own), home[start, 1]] = -1
-        dist_sq[rows] = part
-        farthest = part.argmax(1)
-        best[rows], best_id[rows] = part[np.arange(len(rows)), farthest], ids[rows, farthest]
-        start = int(best_id[best == best.max()].min())
-    return chosen
 
 
 def _farthest_steps(points: Tensor, m: int, start: Tensor, skip_near_origin: bool) -> Tensor:

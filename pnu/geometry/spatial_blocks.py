@@ -3,9 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 Points = NDArray[np.floating]
 Index = NDArray[np.int64]
@@ -74,17 +72,17 @@ def split_blocks(points: Points, size: int) -> Blocks:
     return Blocks(members, np.array([low for low, _ in boxes]), np.array([high for _, high in boxes]))
 
 
-def along_curve(points: Tensor) -> Tensor:
+def along_curve(points: Points) -> Index:
     """Order of the points (n, 3) along a Morton curve, (n,): what is near in the order is near in space, mostly.
 
     Searches and gathers in this order find in the processor's cache what the ones before have used.
     """
-    low, high = points.amin(0), points.amax(0)
-    scale = (2**CURVE - 1) / (high - low).max().clamp_min(torch.finfo(points.dtype).tiny)
-    code = torch.zeros(len(points), dtype=torch.int64, device=points.device)
+    low, high = points.min(0), points.max(0)
+    scale = (2**CURVE - 1) / max((high - low).max(), 2**CURVE * np.finfo(points.dtype).tiny)
+    code = np.zeros(len(points), np.int64)
     for axis in range(3):
-        cell = ((points[:, axis] - low[axis]) * scale).long()
+        cell = ((points[:, axis] - low[axis]) * scale).astype(np.int64)
         for shift, mask in SPREAD_BITS:
             cell = (cell | (cell << shift)) & mask
         code |= cell << axis
-    return code.argsort(stable=True)
+    return code.argsort(kind="stable")

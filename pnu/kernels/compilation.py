@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
-KERNELS = ("boxes", "neighbors", "greedy_sampling", "frames", "projector", "dipoles", "planes")
+KERNELS = ("boxes", "neighbors", "greedy_sampling", "frames", "projector", "dipoles", "planes", "pushes")
 COMPLETE, LOCK, FAILED = "complete", "lock", "failed"
 OLD = 30 * 86400  # seconds
 EXACT = {"nnan", "ninf", "nsz"}  # results have the bits of NumPy's operations in the order written

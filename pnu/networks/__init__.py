@@ -5,14 +5,15 @@ A network maps patches (B, n, 6) to (B, ratio n, 6). `pnu.fast` computes the sam
 
 import importlib
 from collections.abc import Mapping, Sequence
-from typing import Any
-
-from torch import nn
+from typing import TYPE_CHECKING, Any
 
 from pnu.config.instantiate import is_within, present_name
 
+if TYPE_CHECKING:
+    from torch import nn
 
-def build_network(config: Mapping[str, Any], allow: Sequence[str] = ()) -> nn.Module:
+
+def build_network(config: Mapping[str, Any], allow: Sequence[str] = ()) -> "nn.Module":
     """Build a network from a plain config: `_target_` names its class, the other keys are its arguments.
 
     Only classes below `pnu.networks`, and of the packages `allow`, are built: a config from elsewhere runs no other
@@ -21,6 +22,8 @@ def build_network(config: Mapping[str, Any], allow: Sequence[str] = ()) -> nn.Mo
     Raises:
         ValueError: `_target_` is missing, lies outside these packages, or does not accept the arguments.
     """
+    from torch import nn
+
     # as older runs and weights spell it
     arguments = {str(key).replace("neighbour", "neighbor"): value for key, value in config.items()}
     target = present_name(str(arguments.pop("_target_", "")))

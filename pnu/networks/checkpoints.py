@@ -7,6 +7,8 @@
 Checkpoints are read with `weights_only=True`: tensors and plain types, never code.
 """
 
+from __future__ import annotations
+
 import datetime
 import io
 import json
@@ -16,15 +18,16 @@ import warnings
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 import yaml
-from torch import Tensor, nn
 
 from pnu import networks, weights
 from pnu.io import atomic_path, write_json
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
 
 PREFIX = "model."
 NEWEST = "newest"  # instead of a run folder
@@ -92,6 +95,8 @@ def resolve(source: str | PathLike[str]) -> str | PathLike[str]:
 
 def _unfilled(config: Mapping[str, Any], allow: Sequence[str]) -> nn.Module:
     """The network of a config, to be filled, in float32; what it draws at first leaves no trace in the generator."""
+    import torch
+
     with torch.device("cpu"), torch.random.fork_rng(devices=[]):
         return networks.build_network(config, allow).float()
 
@@ -120,6 +125,8 @@ def checkpoint_path(folder: Path) -> Path:
 
 def read_checkpoint(path: str | PathLike[str]) -> dict[str, Any]:
     """A checkpoint's dict, read as tensors, plain types and NumPy scalars; ValueError if it holds anything else."""
+    import torch
+
     scalar = np.float64(0).__reduce__()[0]  # what a pickled NumPy scalar calls
     numbers: list[Any] = [(scalar, "numpy.core.multiarray.scalar"), scalar, np.dtype]
     try:
@@ -141,6 +148,8 @@ def read_checkpoint(path: str | PathLike[str]) -> dict[str, Any]:
 
 def write_checkpoint(path: str | PathLike[str], content: Mapping[str, Any]) -> None:
     """Write a checkpoint, whole or not at all."""
+    import torch
+
     buffer = io.BytesIO()  # where torch itself writes to a full disk, its error does not say so
     torch.save(dict(content), buffer)
     with atomic_path(Path(path)) as temporary, temporary.open("wb") as file, buffer.getbuffer() as raw:

@@ -5,6 +5,7 @@ sphere gives a first foot and normal; a small network shared by all neighbors, w
 corrects both. How clouds become dense with it, is in `pnu.upsamplers.surface_projection`.
 """
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear, normalize
@@ -12,12 +13,12 @@ from torch.nn.functional import linear, normalize
 from pnu.geometry.even_spacing import tangent_discs
 from pnu.geometry.local_frames import FEATURES, local_frames
 from pnu.geometry.neighbor_features import gather
+from pnu.geometry.neighbor_ranks import neighbor_ranks
 from pnu.geometry.neighbor_search import knn
 from pnu.geometry.sampling import farthest_points
 
 EACH = 3  # seeds of a point, in training, before they are thinned out
 PUSH = 0.1  # between rounds of training, beside the way from its point to a seed
-DENSE = 16  # neighbors that are all looked at; farther ones are thinned out
 
 
 class Projector(nn.Module):
@@ -181,7 +182,9 @@ class Surface(nn.Module):
         """
         self.check_input("points", patch.shape[1])
         count = self.queries
-        discs = torch.stack([tangent_discs(p[:, :3], p[:, 3:], EACH, first=count) for p in patch])
+        arrays = patch.detach().cpu().numpy()
+        seeds_of = [tangent_discs(p[:, :3], p[:, 3:], EACH, first=count) for p in arrays]
+        discs = torch.from_numpy(np.stack(seeds_of)).to(patch)
         parents = patch[:, :count, None].expand(-1, -1, EACH, -1)
         seeds = torch.cat([discs, parents[..., 3:]], -1).flatten(1, 2)
         push = torch.cat([PUSH * (discs - parents[..., :3]), torch.zeros_like(discs)], -1).flatten(1, 2)
@@ -215,8 +218,7 @@ class Surface(nn.Module):
 
     def ranks(self, n: int) -> list[int]:
         """Ranks of the neighbors that are looked at, of those that a cloud of n points has."""
-        far = torch.linspace(DENSE, self.reach - 1, max(self.neighbors - DENSE, 0)).round().long().tolist()
-        return [rank for rank in [*range(min(DENSE, self.neighbors)), *far] if rank < n]
+        return neighbor_ranks(self.neighbors, self.reach, n)
 
     def forward(self, patch: Tensor) -> Tensor:
         """As in training: patch (B, n, 6) -> (B, queries, 6). Whole clouds: `pnu.upsamplers.surface_projection`."""

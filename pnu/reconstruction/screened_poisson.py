@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -81,7 +80,7 @@ def reconstruct(
         raise ValueError(f"{name}: has no normals; Poisson reconstruction needs them, estimate them first")
     if depth is not None and not 1 <= depth <= 16:
         raise ValueError(f"depth={depth}: expected 1 to 16, 8 is usual")
-    given = complete_normals(torch.from_numpy(points), torch.from_numpy(given)).numpy()
+    given = complete_normals(points, given)
     depth = octree_depth(points, box) if depth is None else depth
     center, radius = (points.min(0) + points.max(0)) / 2, np.ptp(points, axis=0).max() / 2
     found = run_child((points - center) / radius, given, depth, timeout, box)

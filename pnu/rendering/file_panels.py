@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from pnu.geometry.mesh_topology import vertex_normals
@@ -75,7 +74,7 @@ def read_shape(path: str, columns: str | None = None) -> Shape:
     points, normals, attributes, notes = read_cloud(path, minimum=1, columns=columns)
     if normals is not None and np.isnan(normals).any():
         enough = len(points) >= MINIMUM
-        normals = complete_normals(torch.from_numpy(points), torch.from_numpy(normals)).numpy() if enough else None
+        normals = complete_normals(points, normals) if enough else None
     return Shape(path, points, normals, None, attributes, notes)
 
 

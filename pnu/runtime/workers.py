@@ -21,30 +21,32 @@ from types import TracebackType
 from typing import Any, Protocol
 
 import numpy as np
-import torch
-from torch import Tensor, nn
+from numpy.typing import NDArray
 
-Work = Callable[[Tensor], Tensor]
+from pnu.runtime.threads import thread_count, torch_if_loaded
+
+Array = NDArray[Any]
+Work = Callable[[Array], Array]
 """What is made of one part."""
-Begin = Callable[[Any, Tensor], Work]
+Begin = Callable[[Any, Array], Work]
 """begin(network, cloud): the work on parts of this cloud; what all parts need, such as a tree, is made once."""
 
 
 class Workers(Protocol):
     """Who works, each with a network."""
 
-    def map(self, begin: Begin, cloud: Tensor, parts: Sequence[Tensor]) -> Iterator[Tensor]:
+    def map(self, begin: Begin, cloud: Array, parts: Sequence[Array]) -> Iterator[Array]:
         """The work on each part of a cloud, in order. `begin` is the same object as long as the work is the same."""
 
 
 class InProcess:
     """Works in this process."""
 
-    def __init__(self, network: nn.Module) -> None:
+    def __init__(self, network: Any) -> None:
         self.network = network
-        self.begun: tuple[Begin, Tensor] | None = None
+        self.begun: tuple[Begin, Array] | None = None
 
-    def map(self, begin: Begin, cloud: Tensor, parts: Sequence[Tensor]) -> Iterator[Tensor]:
+    def map(self, begin: Begin, cloud: Array, parts: Sequence[Array]) -> Iterator[Array]:
         """See `Workers`."""
         if self.begun is None or self.begun[0] is not begin or self.begun[1] is not cloud:
             self.begun, self.work = (begin, cloud), begin(self.network, cloud)
@@ -55,19 +57,19 @@ class Processes:
     """Works in processes of their own, one for each of `devices`; a context.
 
     The network, which lies on the CPU, and what begins the work are pickled. Clouds go there through a file that all
-    map, so they share its memory; parts and results through pipes. The threads of torch are shared out. An error
+    map, so they share its memory; parts and results through pipes. The threads are shared out. An error
     becomes a `ValueError` of one line. A process ends with this one, however that ends.
     """
 
-    def __init__(self, network: nn.Module, devices: Sequence[str]) -> None:
+    def __init__(self, network: Any, devices: Sequence[str]) -> None:
         self.devices = devices
         context = multiprocessing.get_context("spawn")  # CUDA and threads do not survive a fork
         names = context.SimpleQueue()
         for device in devices:
             names.put(device)
-        share = max(1, torch.get_num_threads() // len(devices))
+        share = max(1, thread_count() // len(devices))
         self.pool = ProcessPoolExecutor(len(devices), context, _start, (pickle.dumps(network), names, share))
-        self.cloud: Tensor | None = None
+        self.cloud: Array | None = None
         self.path, self.number = Path(), count()
 
     def __enter__(self) -> "Processes":
@@ -81,15 +83,13 @@ class Processes:
         self.pool.shutdown(cancel_futures=True)
         self.folder.cleanup()
 
-    def map(self, begin: Begin, cloud: Tensor, parts: Sequence[Tensor]) -> Iterator[Tensor]:
+    def map(self, begin: Begin, cloud: Array, parts: Sequence[Array]) -> Iterator[Array]:
         """See `Workers`; ValueError where a process ended amid its work."""
         if cloud is not self.cloud:
             self.cloud, self.path = cloud, Path(self.folder.name) / f"{next(self.number)}.npy"
-            np.save(self.path, cloud.cpu().numpy())
+            np.save(self.path, cloud)
         try:
-            tasks = (part.cpu().numpy() for part in parts)
-            found = self.pool.map(_work, repeat(pickle.dumps(begin)), repeat(str(self.path)), tasks)
-            yield from map(torch.from_numpy, found)
+            yield from self.pool.map(_work, repeat(pickle.dumps(begin)), repeat(str(self.path)), parts)
         except BrokenProcessPool:
             raise ValueError(
                 f"devices={len(self.devices)}: a process ended amid its work; with too little memory, take fewer. "
@@ -115,18 +115,19 @@ class _Worker:
 
     def __init__(self, network: bytes, device: str) -> None:
         self.pickled, self.device = network, device
-        self.network: nn.Module | None = None
+        self.network: Any = None
         self.begun = (b"", "")
 
     def __call__(self, begin: bytes, cloud: str, part: np.ndarray) -> np.ndarray:
         try:
             if self.network is None:
-                self.network = pickle.loads(self.pickled).to(self.device)
+                self.network = pickle.loads(self.pickled)
+                _settle_torch(int(os.environ["OMP_NUM_THREADS"]))
+                self.network = self.network.to(self.device) if hasattr(self.network, "to") else self.network
             if (begin, cloud) != self.begun:
-                points = torch.from_numpy(np.load(cloud, mmap_mode="c"))
-                self.work: Work = pickle.loads(begin)(self.network, points)
+                self.work: Work = pickle.loads(begin)(self.network, np.load(cloud, mmap_mode="c"))
                 self.begun = begin, cloud
-            return self.work(torch.from_numpy(part)).cpu().numpy()
+            return self.work(part)
         except ValueError:
             raise
         except Exception as error:
@@ -140,9 +141,15 @@ _worker: _Worker
 def _start(network: bytes, names: "SimpleQueue[str]", threads: int) -> None:
     global _worker
     _worker = _Worker(network, names.get())
-    torch.set_num_threads(threads)
-    torch.set_grad_enabled(False)
+    os.environ["OMP_NUM_THREADS"] = str(threads)  # what torch goes by too where it is loaded later
+    _settle_torch(threads)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _settle_torch(threads: int) -> None:
+    if torch := torch_if_loaded():
+        torch.set_num_threads(threads)
+        torch.set_grad_enabled(False)
 
 
 def _end_with_parent() -> None:

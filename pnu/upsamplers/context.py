@@ -1,26 +1,30 @@
 """What every upsampler has in common."""
 
-from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from __future__ import annotations
 
-import torch
-from torch import Tensor
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from pnu.runtime.parts import Parts
 from pnu.runtime.progress import Progress, silent
 from pnu.runtime.workers import Workers
 from pnu.upsamplers.density import Density
 
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
 
 @dataclass(frozen=True)
 class Context:
-    """How an upsampler runs. Generator, density and keep have an influence on what comes out, nothing else."""
+    """How an upsampler runs. Seed, density and keep have an influence on what comes out, nothing else."""
 
-    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    device: torch.device | str = "cpu"
     """Where the network lies, and the cloud."""
     batch_size: int | None = None
     """Patches or points at once, which bounds the memory; None: by the device."""
-    generator: torch.Generator = field(default_factory=lambda: torch.Generator().manual_seed(0))
+    seed: int = 0
     """Of all that is drawn."""
     progress: Progress = silent
     """Called as progress(stage, done, total)."""
@@ -32,6 +36,13 @@ class Context:
     """Of what comes out: even, follow the cloud's, or auto: even where no place loses points by it."""
     keep: bool = False
     """Whether the points of the cloud are to be among those that come out, unmoved."""
+
+    @cached_property
+    def generator(self) -> torch.Generator:
+        """Draws all that is drawn, from the seed on."""
+        import torch
+
+        return torch.Generator().manual_seed(self.seed)
 
 
 @runtime_checkable

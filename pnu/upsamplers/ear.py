@@ -48,7 +48,7 @@ class EAR:
         apart = spacing(points)
         radius, turns = self.radius * apart, self.turns
         if turns is None:
-            turns = TURNS if noise_level(cloud[:, :3], cloud[:, 3:]) > NOISY * apart else 0
+            turns = TURNS if noise_level(points, normals) > NOISY * apart else 0
         for turn in range(turns):
             context.progress("bilateral normals", turn, turns)
             normals = bilateral_normals(points, normals, radius, self.angle)

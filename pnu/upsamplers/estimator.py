@@ -1,18 +1,23 @@
 """`pnu.upsample` as an object, for many clouds: its settings are given once, and its weights are read once."""
 
+from __future__ import annotations
+
 import inspect
 from collections.abc import Sequence
 from os import PathLike
-from typing import Any, Literal, Self, overload
+from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
 import numpy as np
-from torch import Tensor, nn
 
 from pnu.cleaning import Treatment
 from pnu.runtime.progress import Progress, silent
 from pnu.upsamplers.context import Upsampler
 from pnu.upsamplers.density import Density
-from pnu.upsamplers.whole_clouds import CloudT, LoadedWeights, Model, upsample
+from pnu.upsamplers.inference import LoadedWeights
+from pnu.upsamplers.whole_clouds import CloudT, Model, upsample
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
 
 
 class PointCloudUpsampler:
@@ -66,7 +71,7 @@ class PointCloudUpsampler:
         self.loaded_: Model = self.model
         if isinstance(self.model, str | PathLike):
             self.loaded_ = weights = LoadedWeights(self.model)
-            weights.network(np.empty((0, 3)))
+            weights.network(np.empty((0, 3)), device=self.device)
         return self
 
     @overload

@@ -75,8 +75,8 @@ def completed(moved: np.ndarray, cloud: Tensor, count: int, context: Context) ->
 
     The normals are fitted anew to what is there now, each on the side of the nearest normal of the cloud (n, 6).
     """
-    points = torch.from_numpy(moved)[None]
-    lines = estimate_normals(points, min(16, len(moved)), orient=False)
-    normals = flip_to_reference(lines, points, cloud[None, :, :3], cloud[None, :, 3:])
-    consolidated = torch.cat([points, normals], 2)[0]
+    known = cloud.numpy()
+    lines = estimate_normals(moved, min(16, len(moved)), orient=False)
+    normals = flip_to_reference(lines, moved, known[:, :3], known[:, 3:])
+    consolidated = torch.from_numpy(np.hstack([moved, normals]))
     return consolidated if count == len(consolidated) else Midpoint().upsample_cloud(consolidated, count, context)

@@ -4,8 +4,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.neighbor_search import knn
-from pnu.geometry.sampling import farthest_points_large
 from pnu.runtime.progress import Progress
 from pnu.upsamplers.context import Context
 
@@ -45,6 +45,6 @@ def evenly_spread(cloud: Tensor, count: int, progress: Progress) -> Tensor:
     """Farthest points, exactly `count`."""
     stage = f"farthest points, {count} of {len(cloud)}"
     progress(stage, 0, 1)
-    kept = cloud[farthest_points_large(cloud[:, :3], count)]
+    kept = cloud[farthest_points_large(cloud[:, :3].numpy(), count)]
     progress(stage, 1, 1)
     return kept

@@ -4,22 +4,21 @@ import math
 from functools import partial
 from numbers import Integral
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from pnu.geometry import patch_extraction
-from pnu.geometry.neighbor_search import nearest
-from pnu.geometry.normal_estimation import estimate_normals, flip_to_reference
 from pnu.geometry.unit_sphere import unit_sphere_frame
 from pnu.runtime import threads
 from pnu.runtime.workers import Begin, InProcess, Work, Workers
 from pnu.upsamplers.context import Context
+from pnu.upsamplers.unit_normals import check_finite, with_unit_normals
 
 SMALLEST_PATCH = 64  # points that every network accepts; a smaller cloud is repeated up to it
 SLACK = 1.1  # growth beyond the network's ratio for which overlapping patches have points enough
 KEPT = 256  # patches whose predictions are kept in one file
 BATCHES = 32  # on a CPU, that its threads share
-ZERO = 1e-6  # predicted normals shorter than this have no direction
 
 
 class Patches:
@@ -57,7 +56,8 @@ class Patches:
         run = partial(self._one_pass, begin, context.workers or InProcess(self.network), context)
         *before, last = self.pass_sizes(len(cloud), count)
         for size in before:
-            cloud = with_unit_normals(run(cloud, size), cloud)
+            dense = run(cloud, size).double().numpy()
+            cloud = torch.from_numpy(with_unit_normals(dense, cloud.double().numpy())).to(cloud)
         return run(cloud, last)
 
     def pass_sizes(self, n: int, count: int) -> list[int]:
@@ -88,44 +88,49 @@ class Patches:
         like = example(self.network)
         together = patches_at_once(like, context.batch_size) * (BATCHES if like.device.type == "cpu" else 1)
 
-        def predict(first: int) -> Tensor:
+        places, rows = cloud.numpy(), idx.numpy()
+
+        def predict(first: int) -> np.ndarray:
             found = []
-            parts = torch.split(idx[first : first + KEPT], together)
-            for number, part in enumerate(workers.map(begin, cloud, parts), 1):
+            some = rows[first : first + KEPT]
+            parts = [some[at : at + together] for at in range(0, len(some), together)]
+            for number, part in enumerate(workers.map(begin, places, parts), 1):
                 found.append(part)
                 context.progress(stage, min(first + number * together, len(idx)), len(idx))
-            return torch.cat(found)
+            return np.concatenate(found)
 
         predicted = torch.empty(0)
         for first in range(0, len(idx), KEPT):
-            found = context.parts.get(f"{stage}, patch {first}", partial(predict, first))
+            found = torch.from_numpy(context.parts.get(f"{stage}, patch {first}", partial(predict, first)))
             each = len(found) // min(KEPT, len(idx) - first)  # points of a patch
             if not first:
                 predicted = found.new_empty(len(idx) * each, found.shape[1])
             predicted[first * each : first * each + len(found)] = found
         context.progress(stage, len(idx), len(idx))
         stage = f"farthest points, {count} of {len(predicted)}"
-        return patch_extraction.merge(_finite(predicted)[None], count, partial(context.progress, stage))
+        check_finite(predicted.numpy())
+        return patch_extraction.merge(predicted[None], count, partial(context.progress, stage))
 
 
-def predictions(network: nn.Module, cloud: Tensor, batch_size: int | None = None) -> Work:
+def predictions(network: nn.Module, places: np.ndarray, batch_size: int | None = None) -> Work:
     """Of a cloud (n, 6): patches idx (p, size) -> their predictions, one after the other, in the cloud's frame.
 
     On the CPU each thread works on patches of its own. That is faster than many threads in one operation, and the last
     digit of a matrix product, which may decide between two farthest points, depends on nothing else.
     """
-    like = example(network)
+    like, cloud = example(network), torch.from_numpy(places)
     on_cpu, size = like.device.type == "cpu", patches_at_once(like, batch_size)
 
     def predict(idx: Tensor) -> Tensor:
         patch = cloud[idx]
         frame = unit_sphere_frame(patch)  # in float64, so that float32 has only the patch to resolve
-        dense = frame.from_unit(network(frame.to_unit(patch).to(like)).cpu().double())
+        dense: Tensor = frame.from_unit(network(frame.to_unit(patch).to(like)).cpu().double())
         return dense.flatten(0, 1)
 
-    def work(idx: Tensor) -> Tensor:
-        batches = torch.split(idx, size)
-        return torch.cat(threads.map_on_threads(predict, batches) if on_cpu else [predict(batch) for batch in batches])
+    def work(rows: np.ndarray) -> np.ndarray:
+        batches = torch.split(torch.from_numpy(rows), size)
+        found = threads.map_on_threads(predict, batches) if on_cpu else [predict(batch) for batch in batches]
+        return torch.cat(found).numpy()
 
     return work
 
@@ -138,29 +143,3 @@ def example(network: nn.Module) -> Tensor:
 def patches_at_once(like: Tensor, batch_size: int | None) -> int:
     """Patches that go through the network together."""
     return 1 if like.device.type == "cpu" else batch_size or 64
-
-
-def with_unit_normals(dense: Tensor, sparse: Tensor) -> Tensor:
-    """Predictions (m, 3) or (m, 6) with unit normals, (m, 6); `sparse` (n, 6) is the cloud they were made from.
-
-    A predicted normal without direction becomes that of the nearest input point. Where none are predicted they are
-    estimated from the predicted points, with the side of the nearest input normal.
-    """
-    points = _finite(dense)[:, :3]
-    if dense.shape[1] == 3:
-        normals = estimate_normals(points[None], orient=False)
-        normals = flip_to_reference(normals, points[None], sparse[None, :, :3], sparse[None, :, 3:])[0]
-    else:
-        normals = dense[:, 3:6]
-    length = normals.norm(dim=1, keepdim=True)
-    lost = (~(length > ZERO) | length.isinf()).squeeze(1)  # NaN counts as lost
-    normals = normals / length
-    if bool(lost.any()):
-        normals[lost] = sparse[nearest(points[None, lost], sparse[None, :, :3]).idx[0], 3:]
-    return torch.cat([points, normals], 1)
-
-
-def _finite(prediction: Tensor) -> Tensor:
-    if not bool(torch.isfinite(prediction[:, :3]).all()):
-        raise ValueError("model: predicted points that are NaN or infinite; its weights are damaged, train it again")
-    return prediction

@@ -4,8 +4,8 @@ import torch
 from torch import Tensor
 
 from pnu.geometry.algebraic_sphere import apss_project
+from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.neighbor_search import knn, nearest
-from pnu.geometry.sampling import farthest_points_large
 from pnu.upsamplers.context import Context
 from pnu.upsamplers.midpoints import evenly_spread
 
@@ -33,7 +33,7 @@ class APSS:
         cloud = cloud.cpu()
         context.progress("seeds", 0, 1)
         seeds = _between(cloud[:, :3], -(-self.seeds * count // len(cloud)), self.reach, context.generator)
-        seeds = seeds[farthest_points_large(seeds, min(len(seeds), self.seeds * count // 2))]
+        seeds = seeds[farthest_points_large(seeds.numpy(), min(len(seeds), self.seeds * count // 2))]
         context.progress("seeds", 1, 1)
         context.progress("projection", 0, 1)
         projected = apss_project(seeds, cloud, min(self.neighbors, len(cloud)))

@@ -1,38 +1,35 @@
 """Which upsampler a model or a name means."""
 
-from typing import Any
+from __future__ import annotations
 
-import torch
-from torch import Tensor
+import importlib
+from typing import TYPE_CHECKING, Any
 
 from pnu.upsamplers.context import Context, Upsampler
-from pnu.upsamplers.ear import EAR
-from pnu.upsamplers.l0 import L0
-from pnu.upsamplers.lop import LOP
-from pnu.upsamplers.midpoints import Midpoint
-from pnu.upsamplers.patches import Patches
-from pnu.upsamplers.point_set_surface import APSS
-from pnu.upsamplers.poisson_samples import PoissonSurface
 from pnu.upsamplers.surface_projection import SurfaceProjection
-from pnu.upsamplers.wlop import WLOP
 
-CLASSICAL: dict[str, type[Upsampler]] = {
-    "apss": APSS,
-    "poisson": PoissonSurface,
-    "midpoint": Midpoint,
-    "lop": LOP,
-    "wlop": WLOP,
-    "ear": EAR,
-    "l0": L0,
+if TYPE_CHECKING:
+    from torch import Tensor
+
+CLASSICAL = {
+    "apss": ("point_set_surface", "APSS"),
+    "poisson": ("poisson_samples", "PoissonSurface"),
+    "midpoint": ("midpoints", "Midpoint"),
+    "lop": ("lop", "LOP"),
+    "wlop": ("wlop", "WLOP"),
+    "ear": ("ear", "EAR"),
+    "l0": ("l0", "L0"),
 }
-"""Upsamplers without training, by name."""
+"""Upsamplers without training, by name: file of this folder, and class in it."""
 
 
 def classical(name: str) -> Upsampler:
     """An upsampler without training by its name in `CLASSICAL`."""
     if name not in CLASSICAL:
         raise ValueError(f"method={name}: expected one of {', '.join(CLASSICAL)}")
-    return CLASSICAL[name]()
+    file, cls = CLASSICAL[name]
+    found: Upsampler = getattr(importlib.import_module(f"pnu.upsamplers.{file}"), cls)()
+    return found
 
 
 def upsampler_of(model: Any, patch_size: int | None = None) -> Upsampler:
@@ -48,7 +45,11 @@ def upsampler_of(model: Any, patch_size: int | None = None) -> Upsampler:
     if hasattr(model, "upsample_cloud"):
         itself: Upsampler = model
         return itself
-    return SurfaceProjection(model) if is_projection(model) else Patches(model, patch_size)
+    if is_projection(model):
+        return SurfaceProjection(model)
+    from pnu.upsamplers.patches import Patches
+
+    return Patches(model, patch_size)
 
 
 def is_projection(network: Any) -> bool:
@@ -61,6 +62,8 @@ def dense_patches(network: Any, patches: Tensor) -> Tensor:
     if not is_projection(network):
         dense: Tensor = network(patches)
         return dense
+    import torch
+
     upsampler, count = SurfaceProjection(network), network.ratio * patches.shape[1]
     context = Context(device=patches.device)
     with torch.no_grad():

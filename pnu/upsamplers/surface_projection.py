@@ -3,30 +3,40 @@
 There are no patches, hence no borders; the cost grows with the output; any ratio is possible.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numpy as np
-import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
-from pnu.fast.compiled_projector import compiled_projection, compiled_spheres
 from pnu.geometry.cloud_statistics import FAINT
 from pnu.geometry.even_spacing import repel, tangent_discs
-from pnu.geometry.local_frames import feet
-from pnu.geometry.neighbor_search import Search, knn, nearest
+from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.noise_level import noise_level
-from pnu.geometry.sampling import farthest_points_large
+from pnu.geometry.point_tree import PointTree
 from pnu.geometry.spacing import spacing
 from pnu.geometry.spatial_blocks import along_curve
 from pnu.kernels.compilation import compile_in_background
-from pnu.networks.surface import Surface
+from pnu.networks.compiled_surface import CompiledSurface, Project, compiled_feet
 from pnu.runtime import threads
 from pnu.runtime.progress import Progress, Step, silent
 from pnu.runtime.workers import Begin, InProcess, Work, Workers
 from pnu.upsamplers.context import Context
 from pnu.upsamplers.density import groups_of_like_spacing, point_counts
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from pnu.networks.surface import Surface
+
+Network: TypeAlias = "Surface | CompiledSurface"
+Floats = NDArray[np.float64]
+Index = NDArray[np.int64]
+CloudT = TypeVar("CloudT", "Floats", "Tensor")
 
 EVEN = 0.3  # standard deviation over mean of the nearest distance; 0.52 at random
 SMOOTH = 0.1  # noise in spacings from which on a cloud is smoothed first
@@ -46,22 +56,27 @@ CLOSE = 12  # neighbors of the sphere that candidates are first moved to
 class SurfaceProjection:
     """The procedure for a network that projects: seeds, spheres, a shortlist projected, even spacing, rejection.
 
-    Nothing is random. How many seeds, and so on, says the network.
+    Nothing is random. How many seeds, and so on, says the network. Clouds are arrays; what projects them is compiled
+    kernels, without torch, or the network, wherever it lies.
     """
 
     parallel = True
     follows = True
 
-    def __init__(self, network: Surface) -> None:
+    def __init__(self, network: Network) -> None:
         self.network = network
 
-    @torch.no_grad()
-    def upsample_cloud(self, cloud: Tensor, count: int, context: Context) -> Tensor:
-        """cloud (n, 6) -> (count, 6) with unit normals.
+    def upsample_cloud(self, cloud: CloudT, count: int, context: Context) -> CloudT:
+        """cloud (n, 6) -> (count, 6) with unit normals, an array or a tensor.
 
         The points of a cloud that is noisy beside their spacing are themselves projected first.
         """
-        if count >= LONG and cloud.device.type == "cpu":
+        if not isinstance(cloud, np.ndarray):
+            import torch
+
+            found = self.upsample_cloud(cloud.detach().cpu().double().numpy(), count, context)
+            return torch.from_numpy(found).to(cloud)
+        if count >= LONG:
             compile_in_background()
         cloud = self.with_refined_normals(cloud, self.network.passes, context)
         if noise_in_spacings(cloud) > SMOOTH:
@@ -69,7 +84,7 @@ class SurfaceProjection:
             measured, cloud = cloud, smooth
         else:
             measured = cloud
-        places = cloud[:, :3].cpu().numpy()
+        places = cloud[:, :3]
         counts = point_counts(places, count, context.density)
         if counts is None:
             return self.spread(cloud, cloud[:0] if not context.keep else measured, len(cloud), count, context)
@@ -80,9 +95,9 @@ class SurfaceProjection:
             named = partial(_named, context.progress, f"density {number + 1}, ")
             part = replace(context, progress=named, parts=context.parts.within(f"density_{number + 1}"))
             found.append(self.spread(cloud[np.concatenate([rows, others])], kept, len(rows), some, part))
-        return torch.cat(found)
+        return np.concatenate(found)
 
-    def spread(self, cloud: Tensor, kept: Tensor, first: int, count: int, context: Context) -> Tensor:
+    def spread(self, cloud: Floats, kept: Floats, first: int, count: int, context: Context) -> Floats:
         """Evenly spread points (count, 6) where the first points of a cloud (n, 6) are the nearest of its points.
 
         Those that are `kept` (k, 6) come first, as they are but for their normals; others fill the places between.
@@ -92,17 +107,16 @@ class SurfaceProjection:
         if new <= 0:
             return self.with_normals(kept[:count], cloud, context)
 
-        def named(name: str, compute: Callable[[Step], Tensor]) -> Tensor:
-            """A part by the name of its stage, on the cloud's device."""
-            stage = partial(context.progress, name)
-            return context.parts.get(name, lambda: compute(stage)).to(cloud)
+        def named(name: str, compute: Callable[[Step], Floats]) -> Floats:
+            """A part by the name of its stage."""
+            return context.parts.get(name, lambda: compute(partial(context.progress, name)))
 
         each = max(1, round(network.seeds * new / first))
         candidates, some, more = (
             round(share * new) for share in (network.candidates, network.shortlist, 1 + network.reject)
         )
         query = named("seeds", lambda step: seeds_around(cloud, each, candidates, step, first=first))
-        if network.projector.sphere:
+        if starts_on_spheres(network):
             to_sphere = partial(spheres, batch_size=context.batch_size)
             query, _ = in_parts(to_sphere, query, cloud, workers=in_process, context=context, stage="spheres")
         query = named("shortlist", lambda step: thin_between(query, some, kept, step))
@@ -115,9 +129,9 @@ class SurfaceProjection:
         query = query[reject_worst(query[:, :3], error, new)]
         if first == len(cloud):  # of a part others make what lies at its borders
             query = self.covering(query, kept, cloud, context)
-        return torch.cat([self.with_normals(kept, cloud, context), query]) if len(kept) else query
+        return np.concatenate([self.with_normals(kept, cloud, context), query]) if len(kept) else query
 
-    def covering(self, query: Tensor, kept: Tensor, cloud: Tensor, context: Context) -> Tensor:
+    def covering(self, query: Floats, kept: Floats, cloud: Floats, context: Context) -> Floats:
         """Points (m, 6) of which one lies within half a spacing of each point of a cloud (n, 6).
 
         Where neither they nor those that are kept do, the nearest of them comes so near.
@@ -126,30 +140,30 @@ class SurfaceProjection:
             rows, places = approached(query[:, :3], kept[:, :3], cloud[:, :3])
             if not len(rows):
                 break
-            moved = torch.cat([places, query[rows, 3:]], 1)
-            query = query.clone()
+            moved = np.hstack([places, query[rows, 3:]])
+            query = query.copy()
             query[rows], _ = self.projected(moved, cloud, context, f"places without points, {number}")
         return query
 
-    def projected(self, query: Tensor, cloud: Tensor, context: Context, stage: str) -> tuple[Tensor, Tensor]:
+    def projected(self, query: Floats, cloud: Floats, context: Context, stage: str) -> tuple[Floats, Floats]:
         """Queries (m, 6) on the surface of a cloud (n, 6), and the logarithm of their expected error (m,)."""
         project = partial(projections, batch_size=context.batch_size)
         return in_parts(
             project, query, cloud, workers=context.workers or InProcess(self.network), context=context, stage=stage
         )
 
-    def with_refined_normals(self, cloud: Tensor, passes: int, context: Context) -> Tensor:
+    def with_refined_normals(self, cloud: Floats, passes: int, context: Context) -> Floats:
         """A cloud (n, 6) with the normals that the network finds at its points, so many times one after the other."""
         for number in range(1, passes + 1):
             cloud = self.with_normals(cloud, cloud, context, f"normals, pass {number}")
         return cloud
 
     def with_normals(
-        self, kept: Tensor, cloud: Tensor, context: Context, stage: str = "normals of the points kept"
-    ) -> Tensor:
+        self, kept: Floats, cloud: Floats, context: Context, stage: str = "normals of the points kept"
+    ) -> Floats:
         """Points (k, 6) with the normals that the network finds at their places."""
         there, _ = self.projected(kept, cloud, context, stage)
-        return torch.cat([kept[:, :3], there[:, 3:]], 1)
+        return np.hstack([kept[:, :3], there[:, 3:]])
 
 
 def _named(progress: Progress, prefix: str, stage: str, done: int, total: int) -> None:
@@ -157,103 +171,104 @@ def _named(progress: Progress, prefix: str, stage: str, done: int, total: int) -
 
 
 def in_parts(
-    begin: Begin, query: Tensor, cloud: Tensor, *, workers: Workers, context: Context, stage: str
-) -> tuple[Tensor, Tensor]:
+    begin: Begin, query: Floats, cloud: Floats, *, workers: Workers, context: Context, stage: str
+) -> tuple[Floats, Floats]:
     """query (m, 6) -> projected (m, 6) and logarithm of the expected error (m,)."""
-    size = queries_at_once(cloud, context.batch_size) * (BATCHES if cloud.device.type == "cpu" else 1)
+    on_cpu = str(context.device) == "cpu"
+    size = queries_at_once(on_cpu, context.batch_size) * (BATCHES if on_cpu else 1)
     order = along_curve(query[:, :3])
     query = query[order]
 
-    def project(first: int) -> Tensor:
-        parts = torch.split(query[first : first + KEPT], size)
+    def project(first: int) -> Floats:
+        some = query[first : first + KEPT]
+        parts = [some[at : at + size] for at in range(0, len(some), size)]
         found = []
         for number, part in enumerate(workers.map(begin, cloud, parts), 1):
-            found.append(part.to(cloud))
+            found.append(part)
             context.progress(stage, min(first + number * size, len(query)), len(query))
-        return torch.cat(found)
+        return np.concatenate(found)
 
     context.progress(stage, 0, len(query))
-    everything = torch.empty(len(query), 7, dtype=query.dtype, device=query.device)
+    everything = np.empty((len(query), 7))
     for first in range(0, len(query), KEPT):
         found = context.parts.get(f"{stage}, {first} of {len(query)}", partial(project, first))
-        everything[order[first : first + KEPT]] = found.to(everything)
+        everything[order[first : first + KEPT]] = found
     context.progress(stage, len(query), len(query))
     return everything[:, :6], everything[:, 6]
 
 
-def projections(network: Surface, cloud: Tensor, batch_size: int | None = None) -> Work:
+def projections(network: Any, cloud: Floats, batch_size: int | None = None) -> Work:
     """Around a cloud (n, 6): queries (m, 6) -> projected and logarithm of the expected error, (m, 7)."""
+    cloud = cloud[along_curve(cloud[:, :3])]
+    project = _compiled(network)
+    if project is None:
+        from pnu.upsamplers.network_projection import network_projections
+
+        return network_projections(network, cloud, partial(queries_at_once, batch_size=batch_size))
     ranks = network.ranks(len(cloud))
-    compiled = compiled_projection(network)
 
-    def project(query: Tensor, cloud: Tensor, idx: Tensor) -> Tensor:
-        if len(ranks) < idx.shape[1]:
-            idx = idx[:, ranks]
-        if compiled:
-            return compiled(query, cloud, idx)
-        projected, log_error, spacing = network.project(query[None], cloud[None], idx[None])
-        return torch.cat([projected[0], (log_error[0] + spacing[0].log()).to(projected)[:, None]], 1)
+    def chosen(query: Floats, cloud: Floats, idx: Index) -> Floats:
+        return project(query, cloud, idx[:, ranks] if len(ranks) < idx.shape[1] else idx)
 
-    return by_neighbors(project, cloud.to(network.projector.out.weight.device), network.reach, batch_size)
+    return by_neighbors(chosen, cloud, network.reach, batch_size)
 
 
-def spheres(network: Surface, cloud: Tensor, batch_size: int | None = None) -> Work:
+def spheres(network: Any, cloud: Floats, batch_size: int | None = None) -> Work:
     """As `projections`, but to the sphere that fits the nearest points, without network and expected error."""
-    like = network.projector.out.weight
-    compiled = compiled_spheres(like)
+    cloud = cloud[along_curve(cloud[:, :3])]
+    if _compiled(network) is None:
+        from pnu.upsamplers.network_projection import network_spheres
 
-    def project(query: Tensor, cloud: Tensor, idx: Tensor) -> Tensor:
-        if compiled:
-            return compiled(query, cloud, idx)
-        near = cloud[idx]
-        offsets = near[..., :3] - query[:, None, :3]
-        step, normal = (x.to(query) for x in feet(*(x.to(like) for x in (offsets, near[..., 3:], query[:, 3:]))))
-        return torch.cat([query[:, :3] + step, normal, torch.zeros_like(step[:, :1])], 1)
-
-    return by_neighbors(project, cloud.to(like.device), CLOSE, batch_size)
+        return network_spheres(network, cloud, CLOSE, partial(queries_at_once, batch_size=batch_size))
+    return by_neighbors(compiled_feet, cloud, CLOSE, batch_size)
 
 
-def by_neighbors(
-    project: Callable[[Tensor, Tensor, Tensor], Tensor], cloud: Tensor, k: int, batch_size: int | None
-) -> Work:
+def _compiled(network: Any) -> Project | None:
+    """The step of a network by compiled kernels, or None."""
+    if isinstance(network, CompiledSurface):
+        return network.project
+    from pnu.fast.compiled_projector import compiled_projection
+
+    return compiled_projection(network)
+
+
+def by_neighbors(project: Project, cloud: Floats, k: int, batch_size: int | None) -> Work:
     """project(queries (m, 6), cloud (n, 6), their k nearest points as idx (m, k)), for queries in batches.
 
-    On the CPU each thread works on batches of its own, so the result does not depend on their number.
+    Each thread works on batches of its own, so the result does not depend on their number.
     """
-    cloud = cloud[along_curve(cloud[:, :3])]
-    search, size, on_cpu = Search(cloud[:, :3]), queries_at_once(cloud, batch_size), cloud.device.type == "cpu"
+    tree, size = PointTree(cloud[:, :3]), queries_at_once(True, batch_size)
 
-    def work(query: Tensor) -> Tensor:
-        query = query.to(cloud)
-        idx = search.knn(query[:, :3], min(k, len(cloud)), ordered=True).idx
+    def work(query: Floats) -> Floats:
+        idx = tree.nearest_sq(query[:, :3], min(k, len(cloud)), threads=threads.thread_count(), ordered=True)[1]
         batches = [slice(start, start + size) for start in range(0, len(query), size)]
-
-        def batch(part: slice) -> Tensor:
-            return project(query[part], cloud, idx[part])
-
-        return torch.cat(threads.map_on_threads(batch, batches) if on_cpu else [batch(part) for part in batches])
+        return np.concatenate(threads.map_on_threads(lambda part: project(query[part], cloud, idx[part]), batches))
 
     return work
 
 
-def queries_at_once(cloud: Tensor, batch_size: int | None) -> int:
+def starts_on_spheres(network: Any) -> bool:
+    """Whether candidates are first moved to the sphere that fits their neighbors, as the network begins there."""
+    return bool(network.sphere if isinstance(network, CompiledSurface) else network.projector.sphere)
+
+
+def queries_at_once(on_cpu: bool, batch_size: int | None) -> int:
     """Queries that go through the network together."""
-    return batch_size or (BATCH if cloud.device.type == "cpu" else 2**16)
+    return batch_size or (BATCH if on_cpu else 2**16)
 
 
-def noise_in_spacings(cloud: Tensor) -> float:
+def noise_in_spacings(cloud: Floats) -> float:
     """Noise of a cloud (n, 6) in units of the spacing of its points."""
-    return noise_level(cloud[:, :3], cloud[:, 3:]) / spacing(cloud[:, :3].cpu().numpy())
+    return noise_level(cloud[:, :3], cloud[:, 3:]) / spacing(cloud[:, :3])
 
 
-def is_clean_and_even(cloud: Tensor) -> bool:
+def is_clean_and_even(cloud: Floats) -> bool:
     """Whether the points of a cloud (n, 6) are evenly spread, as farthest points are, and show no noise."""
-    nearest_sq = knn(cloud[None, :, :3], cloud[None, :, :3], 2).dist_sq[0, :, 1]
-    apart = nearest_sq.sqrt()
-    return bool(apart.std() < EVEN * apart.mean()) and noise_in_spacings(cloud) < FAINT
+    apart = PointTree(cloud[:, :3]).among_themselves(2, threads=threads.thread_count())[0][:, 0]
+    return bool(apart.std(ddof=1) < EVEN * apart.mean()) and noise_in_spacings(cloud) < FAINT
 
 
-def seeds_around(cloud: Tensor, each: int, count: int, step: Step = silent, *, first: int | None = None) -> Tensor:
+def seeds_around(cloud: Floats, each: int, count: int, step: Step = silent, *, first: int | None = None) -> Floats:
     """Points of a cloud (n, 6) and `each` seeds around each, thinned to (count, 6), with the points' normals.
 
     With `first` those around the first points alone, and only where no other point is nearer.
@@ -261,74 +276,79 @@ def seeds_around(cloud: Tensor, each: int, count: int, step: Step = silent, *, f
     step(0, 1)
     first = len(cloud) if first is None else first
     discs = tangent_discs(cloud[:, :3], cloud[:, 3:], each, first=first)
-    places = torch.cat([cloud[:first, :3], discs.flatten(0, 1)])
-    owner = torch.cat([torch.arange(first), torch.arange(first).repeat_interleave(each)]).to(cloud.device)
+    places = np.concatenate([cloud[:first, :3], discs.reshape(-1, 3)])
+    owner = np.concatenate([np.arange(first), np.arange(first).repeat(each)])
     del discs
     if first < len(cloud):
-        own = nearest(places[None], cloud[None, :, :3]).idx[0] < first
+        own = _nearest(places, cloud[:, :3])[1] < first
         places, owner = places[own], owner[own]
     if len(places) <= count:
-        kept = torch.arange(len(places), device=cloud.device)
+        kept = np.arange(len(places))
         step(1, 1)
     else:
-        kept = torch.from_numpy(farthest_points_large(places, count, step=step)).to(cloud.device)
-    return torch.cat([places[kept], cloud[owner[kept], 3:]], 1)
+        kept = farthest_points_large(places, count, step=step)
+    return np.hstack([places[kept], cloud[owner[kept], 3:]])
 
 
-def reject_worst(points: Tensor, error: Tensor, count: int) -> Tensor:
+def reject_worst(points: Floats, error: Floats, count: int) -> Index:
     """Indices (count,), ascending, of the points (m, 3) that stay when those of the highest error (m,) are dropped.
 
     Of neighbors only the worst goes, as long as there are others to drop: a bad point without its surroundings would
     be a hole.
     """
     surplus = len(points) - count
-    doubtful = error.argsort(descending=True, stable=True)[: DOUBTFUL * surplus]
-    around = knn(points[None, doubtful], points[None], min(AROUND, len(points))).idx[0]
-    worst = error[doubtful] >= error[around].amax(1)
-    stays = torch.ones_like(error, dtype=torch.bool)
-    stays[torch.cat([doubtful[worst], doubtful[~worst]])[:surplus]] = False
-    return stays.nonzero()[:, 0]
+    doubtful = (-error).argsort(kind="stable")[: DOUBTFUL * surplus]
+    around = PointTree(points).nearest(points[doubtful], min(AROUND, len(points)), threads=threads.thread_count())[1]
+    worst = error[doubtful] >= error[around].max(1)
+    stays = np.ones(len(points), bool)
+    stays[np.concatenate([doubtful[worst], doubtful[~worst]])[:surplus]] = False
+    return np.flatnonzero(stays)
 
 
-def approached(cloud: Tensor, kept: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+def approached(cloud: Floats, kept: Floats, points: Floats) -> tuple[Index, Floats]:
     """Rows (k,) of a cloud (m, 3) to be moved, and where to (k, 3), for points (n, 3) that have none of it near.
 
     Near is half of the spacing of the points; none of those that are kept (l, 3) lies there either. Each row moves
     once, for the barest point.
     """
-    around = knn(points[None], points[None], min(SPACED + 1, len(points))).dist_sq[0, :, 1:]
-    reach = COVERED * around.sqrt().mean(1)
-    found = nearest(points[None], torch.cat([cloud, kept])[None])
-    apart, row = found.dist_sq[0].sqrt(), found.idx[0]
-    share = apart / reach.clamp_min(1e-300)
-    bare = share.argsort(descending=True, stable=True)[: int((share > 1).sum())]
+    around = PointTree(points).among_themselves(min(SPACED + 1, len(points)), threads=threads.thread_count())[0]
+    reach = COVERED * around.mean(1)
+    apart, row = _nearest(points, np.concatenate([cloud, kept]))
+    share = apart / np.maximum(reach, 1e-300)
+    bare = (-share).argsort(kind="stable")[: int((share > 1).sum())]
     bare = bare[row[bare] < len(cloud)]  # what is kept does not move
-    _, barest = np.unique(row[bare].cpu().numpy(), return_index=True)
-    bare = bare[torch.from_numpy(np.sort(barest)).to(bare.device)]
+    _, barest = np.unique(row[bare], return_index=True)
+    bare = bare[np.sort(barest)]
     to_point = points[bare] - cloud[row[bare]]
-    step = (apart[bare] - NEARER * reach[bare]) / apart[bare].clamp_min(1e-300)
+    step = (apart[bare] - NEARER * reach[bare]) / np.maximum(apart[bare], 1e-300)
     return row[bare], cloud[row[bare]] + step[:, None] * to_point
 
 
-def even_out(cloud: Tensor, steps: int, step: Step = silent, kept: Tensor | None = None) -> Tensor:
+def even_out(cloud: Floats, steps: int, step: Step = silent, kept: Floats | None = None) -> Floats:
     """A cloud (m, 6) with points moved to an even spacing, between points (k, 6) that stay where they are."""
-    everything = cloud if kept is None else torch.cat([cloud, kept])
+    everything = cloud if kept is None else np.concatenate([cloud, kept])
     moved = repel(everything[:, :3], everything[:, 3:], steps=steps, step=step, movable=len(cloud))
-    return torch.cat([moved[: len(cloud)], cloud[:, 3:]], 1)
+    return np.hstack([moved[: len(cloud)], cloud[:, 3:]])
 
 
-def thin_between(cloud: Tensor, count: int, kept: Tensor, step: Step = silent) -> Tensor:
+def thin_between(cloud: Floats, count: int, kept: Floats, step: Step = silent) -> Floats:
     """Farthest points of a cloud (n, 6) that leave room around those kept (k, 6): (min(n, count), 6)."""
     if len(kept) and len(cloud) > count:
-        even = spacing(kept[:, :3].cpu().numpy()) * (len(kept) / (len(kept) + count)) ** 0.5
-        apart = nearest(cloud[None, :, :3], kept[None, :, :3]).dist_sq[0].sqrt()
-        enough = apart.sort(descending=True).values[count - 1]  # so many have to stay
-        cloud = cloud[apart >= torch.minimum(enough, apart.new_tensor(ROOM * even))]
+        even = spacing(kept[:, :3]) * (len(kept) / (len(kept) + count)) ** 0.5
+        apart = _nearest(cloud[:, :3], kept[:, :3])[0]
+        enough = np.partition(apart, len(apart) - count)[len(apart) - count]  # so many have to stay
+        cloud = cloud[apart >= min(enough, ROOM * even)]
     return thin(cloud, count, step)
 
 
-def thin(cloud: Tensor, count: int, step: Step = silent) -> Tensor:
+def thin(cloud: Floats, count: int, step: Step = silent) -> Floats:
     """Farthest points of a cloud (n, 6): (min(n, count), 6)."""
     if len(cloud) <= count:
         return cloud
-    return cloud[torch.from_numpy(farthest_points_large(cloud[:, :3], count, step=step)).to(cloud.device)]
+    return cloud[farthest_points_large(cloud[:, :3], count, step=step)]
+
+
+def _nearest(queries: Floats, points: Floats) -> tuple[Floats, Index]:
+    """Distance of each query (m, 3) from the nearest of points (n, 3), (m,), and which that is, (m,)."""
+    distance, row = PointTree(points).nearest(queries, 1, threads=threads.thread_count())
+    return distance[:, 0], row[:, 0]

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from pnu import __version__
@@ -26,8 +25,8 @@ from pnu.cleaning.outliers import MANY
 from pnu.geometry.anisotropy import thinned_lines
 from pnu.geometry.cells import Cells
 from pnu.geometry.cloud_normals import contradiction, is_height_map, settled_normals
+from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.point_tree import PointTree
-from pnu.geometry.sampling import farthest_points_large
 from pnu.geometry.spacing import local_spacing
 from pnu.io import atomic_path, read_json, write_json
 from pnu.io.cloud import ORIGIN, UNSEEN, Cloud, first_of_each_place, looks_geographic, unit_normals
@@ -408,7 +407,7 @@ def _look(points: np.ndarray, normals: np.ndarray | None, keys: Keys, size: int)
     look["apart"] = float(np.quantile(local_spacing(points), 0.9))
     known = settled_normals(points, normals).normals
     scale = np.abs(points - points.mean(0)).max()
-    cloud = torch.from_numpy(np.hstack([(points - points.mean(0)) / scale, known]))
+    cloud = np.hstack([(points - points.mean(0)) / scale, known])
     look["noisy"] = noise_in_spacings(cloud) > SMOOTH
     look["even"] = thinned is None and is_clean_and_even(cloud)
     return look

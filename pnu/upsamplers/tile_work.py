@@ -13,31 +13,28 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from pnu.cleaning import stray_points
-from pnu.fast import accelerated
 from pnu.geometry.anisotropy import averaged
 from pnu.geometry.even_spacing import RANK, tangent_discs
 from pnu.geometry.farthest_blocks import decline_of
+from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.normal_estimation import complete_normals
 from pnu.geometry.normal_sides import seen_signs, voted_signs
 from pnu.geometry.point_tree import PointTree
-from pnu.geometry.sampling import farthest_points_large
 from pnu.geometry.unit_sphere import Frame, unit_sphere_frame
 from pnu.io import atomic_path, read_json, write_json
 from pnu.io.sensor import asked_sight
-from pnu.networks import checkpoints
-from pnu.networks.surface import Surface
 from pnu.runtime.progress import Progress, silent
 from pnu.upsamplers.context import Context
 from pnu.upsamplers.density import DENSITIES, SOME, THINNED, groups_of_like_spacing, point_areas
-from pnu.upsamplers.patches import with_unit_normals
+from pnu.upsamplers.inference import LoadedWeights, inferring, modules_of, on_device, weights_source
+from pnu.upsamplers.selection import is_projection
 from pnu.upsamplers.surface_projection import SurfaceProjection
 from pnu.upsamplers.tile_plan import SMALLEST, Plan, attributes_of, structured
-from pnu.upsamplers.whole_clouds import evaluating, modules_of, on_device, output_count, weights_source
+from pnu.upsamplers.unit_normals import with_unit_normals
+from pnu.upsamplers.whole_clouds import output_count
 
 SURPLUS = 0.01  # points made too many, so that an exact number is left where tiles come out a little different
 PLACES = 20_000  # of a tile, around which its area is measured
@@ -46,6 +43,9 @@ REMEMBERED = 1000  # areas of a tile that stand for all
 EDGE = 0.65  # spacings that points are made beyond the last of a tile and its margin
 VOTES = 0.75  # spacings around a point of the coarse cloud where it tells the side
 
+Known = Callable[[NDArray[np.float64]], NDArray[np.bool_]]
+"""Which places (k, 3) in the unit sphere of a tile count, (k,)."""
+
 
 def run_of(plan: Plan) -> str:
     """The weights for all tiles of a plan."""
@@ -53,14 +53,14 @@ def run_of(plan: Plan) -> str:
     return str(weights_source(plan.keys.run, none_given, plan.facts.scanned))
 
 
-def loaded(run: str) -> Surface:
+def loaded(run: str, device: str = "auto") -> Any:
     """The network of a run, which must be one that projects.
 
     Raises:
         ValueError: it is another one.
     """
-    network = checkpoints.load(run)
-    if not isinstance(network, Surface):
+    network = LoadedWeights(run).network(np.empty((0, 3)), device=device)
+    if not is_projection(network):
         raise ValueError(f"run={run}: takes the cloud as a whole, without memory= and tiles=; surface takes tiles")
     return network
 
@@ -68,9 +68,15 @@ def loaded(run: str) -> Surface:
 @contextmanager
 def working(run: str, device: str = "auto") -> Iterator[SurfaceProjection]:
     """The upsampler with the network of a run on a device, made fast, without gradients."""
-    network, _ = on_device(loaded(run), False, device)
-    with torch.no_grad(), evaluating(network), accelerated(modules_of(network)):
+    network, _ = on_device(loaded(run, device), False, device)
+    with inferring(network):
         yield SurfaceProjection(network)
+
+
+def context_of(upsampler: SurfaceProjection, **options: Any) -> Context:
+    """How an upsampler runs whose network may lie on a device."""
+    modules = modules_of(upsampler.network)
+    return Context(next(modules[0].parameters()).device if modules else "cpu", **options)
 
 
 class Share(NamedTuple):
@@ -111,7 +117,7 @@ def prepared(plan: Plan, number: int) -> None:
     share = Share(int(inside.sum()), 0.0, [], 0.0, spread, strays)
     if share.points and len(rows) >= SMALLEST:
         cloud, frame = in_unit_sphere(points, normals)
-        scale = float(frame.scale) ** 2
+        scale = frame.scale.item() ** 2
         areas = point_areas(points)[inside]
         some = np.sort(areas)[:: -(-len(areas) // REMEMBERED)]
         area = surface_area(cloud, inside, partial(_known, plan, number, frame)) * scale
@@ -147,18 +153,18 @@ def _normals(plan: Plan, rows: NDArray[Any]) -> NDArray[np.float64]:
         anew[:] = True
     if given is not None and not anew.any():
         return given
-    lines = complete_normals(unit, torch.from_numpy(given) if known.any() and given is not None else None).numpy()
+    lines = complete_normals(unit, given if known.any() else None)
     if known.any() and not anew[known].any() and asked is None:
         return lines  # those that were missing, to the side of the nearest
     sight = plan.sight(attributes_of(rows))
     if sight is not None and sight.inward is None:
         place = sight.viewpoint
         if place is not None:
-            place = (place - frame.center[0].numpy()) / float(frame.scale)
+            place = (place - frame.center) / frame.scale
             place = place[0] if sight.viewpoint is not None and sight.viewpoint.ndim == 1 else place
-        sign = seen_signs(unit.numpy(), lines, viewpoint=place, up=sight.up)
+        sign = seen_signs(unit, lines, viewpoint=place, up=sight.up)
     else:
-        sign = voted_signs(unit.numpy(), lines, _votes(plan, rows["point"], lines))
+        sign = voted_signs(unit, lines, _votes(plan, rows["point"], lines))
     return lines * np.where(anew, sign, 1.0)[:, None]
 
 
@@ -171,14 +177,14 @@ def _votes(plan: Plan, points: NDArray[np.float64], lines: NDArray[np.float64]) 
     return votes
 
 
-def in_unit_sphere(points: np.ndarray, normals: np.ndarray) -> tuple[Tensor, Frame]:
+def in_unit_sphere(points: np.ndarray, normals: np.ndarray) -> tuple[NDArray[np.float64], Frame]:
     """A cloud (n, 6) in the unit sphere, and the way back."""
-    cloud = torch.from_numpy(np.hstack([points, normals]))
-    frame = unit_sphere_frame(cloud[None])
-    return frame.to_unit(cloud[None])[0], frame
+    cloud = np.hstack([points, normals])
+    frame = unit_sphere_frame(cloud)
+    return frame.to_unit(cloud), frame
 
 
-def surface_area(cloud: Tensor, inside: NDArray[np.bool_], known: Callable[[Tensor], NDArray[np.bool_]]) -> float:
+def surface_area(cloud: NDArray[np.float64], inside: NDArray[np.bool_], known: Known) -> float:
     """Area of the surface around those points of a cloud (n, 6) that are `inside`, (n,).
 
     On a disc around each of some of them: the share that no other point is nearer to. known: which places (k, 3) count,
@@ -186,21 +192,20 @@ def surface_area(cloud: Tensor, inside: NDArray[np.bool_], known: Callable[[Tens
     """
     rows = np.flatnonzero(inside)
     some = rows[:: -(-len(rows) // PLACES)]
-    order = torch.from_numpy(np.concatenate([some, np.setdiff1d(np.arange(len(cloud)), some)]))
-    cloud = cloud[order]
-    discs = tangent_discs(cloud[:, :3], cloud[:, 3:], SEEDS, first=len(some))
-    tree = PointTree(cloud[:, :3].numpy())
-    radius = tree.nearest(cloud[: len(some), :3].numpy(), min(RANK, len(cloud) - 1) + 1)[0][:, -1]
-    nearest = tree.nearest(discs.reshape(-1, 3).numpy(), 1)[1].reshape(len(some), SEEDS)
+    cloud = cloud[np.concatenate([some, np.setdiff1d(np.arange(len(cloud)), some)])]
+    discs: NDArray[Any] = tangent_discs(cloud[:, :3], cloud[:, 3:], SEEDS, first=len(some))
+    tree = PointTree(cloud[:, :3])
+    radius = tree.nearest(cloud[: len(some), :3], min(RANK, len(cloud) - 1) + 1)[0][:, -1]
+    nearest = tree.nearest(discs.reshape(-1, 3), 1)[1].reshape(len(some), SEEDS)
     counts = known(discs.reshape(-1, 3)).reshape(len(some), SEEDS)
     own = (counts & (nearest == np.arange(len(some))[:, None])).mean(1)
     return float((np.pi * radius**2 * own).sum() * len(rows) / len(some))
 
 
-def _known(plan: Plan, number: int, frame: Frame, places: Tensor) -> NDArray[np.bool_]:
+def _known(plan: Plan, number: int, frame: Frame, places: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which places (k, 3) in the unit sphere of a tile lie where it gets points, in cell and margin, (k,)."""
     reach = plan.facts.margin + EDGE * plan.facts.apart
-    return plan.cells.inside(frame.from_unit(places[None])[0].numpy(), number, reach)
+    return plan.cells.inside(frame.from_unit(places), number, reach)
 
 
 class Whole(NamedTuple):
@@ -273,31 +278,28 @@ def made(plan: Plan, number: int, whole: Whole, upsampler: SurfaceProjection, pr
         _save(plan, number, np.empty((0, 6)), 0)
         return
     cloud, frame = in_unit_sphere(rows["point"], rows["normal"])
-    device = next(upsampler.network.parameters()).device
-    context = Context(device, progress=progress, keep=facts.keep)
-    measured = smooth = upsampler.with_refined_normals(cloud.to(device), upsampler.network.passes, context)
+    context = context_of(upsampler, progress=progress, keep=facts.keep)
+    measured = smooth = upsampler.with_refined_normals(cloud, upsampler.network.passes, context)
     if facts.smooth and not facts.keep:
         smooth, _ = upsampler.projected(measured, measured, context, "smoothing, the points are noisy")
-    found: list[Tensor] = []
+    found: list[NDArray[np.float64]] = []
     kept = 0
     for group, count in _groups(rows["point"], cloud, frame, whole, partial(_known, plan, number, frame)):
         others = np.setdiff1d(np.arange(len(cloud)), group)
         fixed = measured[group] if facts.keep else measured[:0]
         order = np.concatenate([group, others])
         raw = upsampler.spread(smooth[order], fixed, len(group), max(count, len(fixed)), context)
-        dense = with_unit_normals(raw.cpu().double(), smooth.cpu())
-        dense = frame.from_unit(dense[None])[0]
+        dense = frame.from_unit(with_unit_normals(raw, smooth))
         if facts.keep:
-            dense[: len(group), :3] = torch.from_numpy(rows["point"][group])
-            given = torch.from_numpy(rows["normal"][group])
+            dense[: len(group), :3] = rows["point"][group]
             if facts.given:
-                dense[: len(group), 3:] = given
+                dense[: len(group), 3:] = rows["normal"][group]
             kept += int(plan.cells.inside(rows["point"][group], number).sum())
             found.insert(0, dense[: len(group)])
             found.append(dense[len(group) :])
         else:
             found.append(dense)
-    points = torch.cat(found).numpy()
+    points = np.concatenate(found)
     _save(plan, number, points[plan.cells.inside(points[:, :3], number)], kept)
 
 
@@ -308,12 +310,16 @@ def _save(plan: Plan, number: int, dense: np.ndarray, kept: int) -> None:
 
 
 def _groups(
-    points: NDArray[np.float64], cloud: Tensor, frame: Frame, whole: Whole, known: Callable[[Tensor], NDArray[np.bool_]]
+    points: NDArray[np.float64],
+    cloud: NDArray[np.float64],
+    frame: Frame,
+    whole: Whole,
+    known: Known,
 ) -> list[tuple[NDArray[np.int64], int]]:
     """Rows of points (n, 3) whose new points lie about as far apart, and how many these are."""
     everything = np.arange(len(points))
     if whole.density:
-        area = surface_area(cloud, np.ones(len(points), bool), known) * float(frame.scale) ** 2
+        area = surface_area(cloud, np.ones(len(points), bool), known) * frame.scale.item() ** 2
         return [(everything, round((1 + SURPLUS) * whole.density * area))]
     areas = point_areas(points)
     counts = (1 + SURPLUS) * np.maximum(whole.floor, whole.level * areas)

@@ -1,48 +1,53 @@
 """Densify whole clouds with a trained network: no Hydra, no Lightning, usable from a notebook."""
 
+from __future__ import annotations
+
 import copy
 import hashlib
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, overload
 
 import numpy as np
-import torch
-from scipy.spatial import cKDTree
-from torch import Tensor, nn
 
 from pnu import __version__
 from pnu.cleaning import Treatment, clean_cloud
-from pnu.fast import accelerated
 from pnu.geometry.attributes import carry
-from pnu.geometry.cloud_normals import settled_normals
+from pnu.geometry.cloud_normals import check_not_a_line, settled_normals
 from pnu.geometry.normal_estimation import complete_normals
+from pnu.geometry.point_tree import PointTree
 from pnu.geometry.unit_sphere import Frame, unit_sphere_frame
 from pnu.io import Cloud, check_cloud
 from pnu.io.library_clouds import Kind, LibraryCloud, kind_of, tensor_like
 from pnu.io.sensor import asked_sight
-from pnu.networks import checkpoints
-from pnu.reconstruction import fill_holes
+from pnu.networks.compiled_surface import CompiledSurface
 from pnu.runtime.parts import Parts
 from pnu.runtime.progress import Progress, silent
+from pnu.runtime.threads import thread_count, torch_if_loaded
 from pnu.runtime.workers import Processes
-from pnu.upsamplers import CLASSICAL, Context, Upsampler, classical, upsampler_of
+from pnu.upsamplers.context import Context, Upsampler
 from pnu.upsamplers.density import DENSITIES, Density, count_of_spacing
+from pnu.upsamplers.inference import LoadedWeights, inferring, modules_of, on_device
 from pnu.upsamplers.learned_normals import learned_normals
-from pnu.upsamplers.patches import with_unit_normals
-from pnu.upsamplers.surface_projection import is_clean_and_even
+from pnu.upsamplers.selection import upsampler_of
+from pnu.upsamplers.surface_projection import SurfaceProjection, is_clean_and_even
+from pnu.upsamplers.unit_normals import with_unit_normals
 
-Model: TypeAlias = "nn.Module | Upsampler | LoadedWeights | str | PathLike[str]"
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor, nn
+
+Model: TypeAlias = "nn.Module | CompiledSurface | Upsampler | LoadedWeights | str | PathLike[str]"
 
 MINIMUM = 16  # points of a cloud
 LARGEST = 10**9  # points of an output
 
 # what comes back as the kind that was given, for type checkers and editors; arrays and lists come back as arrays
-CloudT = TypeVar("CloudT", bound=Tensor | LibraryCloud)
+CloudT = TypeVar("CloudT", bound="Tensor | LibraryCloud")
 
 
 @overload
@@ -192,7 +197,7 @@ def upsample(
     if keep not in (True, False, "auto"):
         raise ValueError(f"keep={keep}: expected true, false or auto")
     given, _, scanned = clean_cloud(given, outliers=outliers, lines="keep" if keep is True else lines, signs=signs)
-    network, target = on_device(*_model(model, given.normals, scanned), device)
+    network, target = on_device(*_model(model, given.normals, scanned, device), device)
     upsampler = upsampler_of(network, patch_size)
     if devices > 1 and not getattr(upsampler, "parallel", False):
         raise ValueError(f"devices={devices}: {type(network).__name__} works in one process; leave devices=1")
@@ -207,35 +212,44 @@ def upsample(
     keeps = (follows and is_clean_and_even(sparse)) if keep == "auto" else keep
     digest = _digest(network, sparse, count, upsampler, density, keeps)
     finished = Parts() if parts is None else Parts(Path(parts) / digest)
-    context = Context(
-        target, batch_size, torch.Generator().manual_seed(seed), progress, finished, density=density, keep=keeps
-    )  # fmt: skip
-    with torch.no_grad(), evaluating(network), accelerated(modules_of(network)), ExitStack() as stack:
-        if torch.get_default_device().type != "cpu":
-            stack.enter_context(torch.device("cpu"))
+    context = Context(target, batch_size, int(seed), progress, finished, density=density, keep=keeps)
+    with inferring(network), ExitStack() as stack:
         if devices > 1:
-            context = replace(context, workers=stack.enter_context(Processes(copy.deepcopy(network).cpu(), names)))
-        raw = upsampler.upsample_cloud(sparse.to(target), count, context)
-        dense = with_unit_normals(raw.cpu().double(), sparse)
-    found = frame.from_unit(dense[None])[0].numpy()
+            theirs = copy.deepcopy(network).cpu() if modules_of(network) else network
+            context = replace(context, workers=stack.enter_context(Processes(theirs, names)))
+        dense = with_unit_normals(_upsampled(upsampler, sparse, count, context), sparse)
+    found = frame.from_unit(dense)
     if keeps:
         found = _measured_first(found, dense, sparse, given)
     if holes is not None:
+        from pnu.reconstruction.hole_filling import fill_holes
+
         progress("holes", 0, 1)
         found = np.vstack([found, fill_holes(found, holes)])
         progress("holes", 1, 1)
     if kind is not None:
         return kind.dense(points, Cloud(found[:, :3], found[:, 3:], attributes(found, given)))
-    return tensor_like(points, found) if isinstance(points, Tensor) else found
+    return tensor_like(points, found) if is_tensor(points) else found
 
 
-def _measured_first(found: np.ndarray, unit: Tensor, sparse: Tensor, given: Cloud) -> np.ndarray:
+def _upsampled(upsampler: Upsampler, sparse: np.ndarray, count: int, context: Context) -> np.ndarray:
+    """What an upsampler makes of a cloud (n, 6): (count, 3 or 6) float64."""
+    if isinstance(upsampler, SurfaceProjection):
+        return upsampler.upsample_cloud(sparse, count, context)
+    import torch
+
+    raw = upsampler.upsample_cloud(torch.from_numpy(sparse).to(context.device), count, context)
+    return raw.cpu().double().numpy()
+
+
+def _measured_first(found: np.ndarray, unit: np.ndarray, sparse: np.ndarray, given: Cloud) -> np.ndarray:
     """The points found (m, 6), those first that were given: in their order, not moved by a bit, with their normals.
 
     In the unit sphere they are `unit` (m, 6), and those given `sparse` (n, 6), sorted.
     """
     rows = np.empty(len(sparse), np.int64)
-    rows[np.lexsort(given.points.T)] = cKDTree(unit[:, :3].numpy()).query(sparse[:, :3].numpy())[1]
+    near = PointTree(unit[:, :3]).nearest(sparse[:, :3], 1, threads=thread_count())[1]
+    rows[np.lexsort(given.points.T)] = near[:, 0]
     kept = found[rows]
     kept[:, :3] = given.points
     if given.normals is not None:
@@ -248,8 +262,7 @@ def attributes(dense: np.ndarray, cloud: Cloud) -> dict[str, np.ndarray]:
     """Colors and scalars of a cloud at the points of its denser version (m, 6), see `pnu.geometry.attributes`."""
     if not cloud.attributes:
         return {}
-    given = None if cloud.normals is None else torch.from_numpy(cloud.normals)
-    normals = complete_normals(torch.from_numpy(cloud.points), given).numpy()
+    normals = complete_normals(cloud.points, cloud.normals)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     sparse = np.hstack([cloud.points, normals / np.maximum(length, 1e-300)])
     return {name: carry(dense, sparse, values) for name, values in cloud.attributes.items()}
@@ -375,22 +388,11 @@ def normals(
     )
     finite = np.isfinite(array).all(1)
     found = np.full(array.shape, np.nan)
-    found[finite] = settled.normals[cKDTree(cloud.points).query(array[finite])[1]]  # each point is one of them
+    same = PointTree(cloud.points).nearest(array[finite], 1)[1][:, 0]  # each point is one of them
+    found[finite] = settled.normals[same]
     if kind is not None:
         return kind.with_normals(points, found)
-    return tensor_like(points, found) if isinstance(points, Tensor) else found
-
-
-def weights_source(
-    model: str | PathLike[str], normals: np.ndarray | None, scanned: bool = False
-) -> str | PathLike[str]:
-    """What `checkpoint.load` takes, for a cloud with these normals: "surface" means one of three, "newest" a run.
-
-    scanned: it lies as scans do, see `pnu.cleaning.Cleaned`.
-    """
-    if model == "surface" and normals is None:
-        return "surface_scans" if scanned else "surface_estimated"
-    return checkpoints.resolve(model)
+    return tensor_like(points, found) if is_tensor(points) else found
 
 
 def _taken(
@@ -416,7 +418,7 @@ def _taken(
 def _array(values: Any, expected: str) -> np.ndarray:
     """An array or a tensor, wherever it lies and whether or not it has a gradient, as float64."""
     try:
-        if isinstance(values, Tensor):
+        if is_tensor(values):
             values = values.detach().cpu().double().resolve_conj().resolve_neg().numpy()
         if np.iscomplexobj(values):
             raise ValueError("complex")
@@ -425,129 +427,78 @@ def _array(values: Any, expected: str) -> np.ndarray:
         raise ValueError(f"{expected}, found {type(values).__name__}") from None
 
 
+def is_tensor(values: object) -> bool:
+    """Whether values are a tensor of torch."""
+    torch = torch_if_loaded()
+    return torch is not None and isinstance(values, torch.Tensor)
+
+
 def _short(value: object) -> str:
     return f"{value:g}" if isinstance(value, Real) else repr(value)[:40]
 
 
-def modules_of(model: object) -> list[nn.Module]:
-    """All modules of a network; of an upsampler without one, none."""
-    return list(model.modules()) if isinstance(model, nn.Module) else []
-
-
-@contextmanager
-def evaluating(model: object) -> Iterator[None]:
-    """A network in eval mode, each of its modules in its own mode again in the end."""
-    training = [module for module in modules_of(model) if module.training]
-    for module in training:
-        module.training = False
-    try:
-        yield
-    finally:
-        for module in training:
-            module.training = True
-
-
-class LoadedWeights:
-    """The network of a run folder, of a file of weights or of shipped ones, read when first needed, and kept.
-
-    Args:
-        source: what `upsample` takes as `model`, as text or a path.
-
-    Raises:
-        ValueError: "newest", and no run has finished.
-    """
-
-    def __init__(self, source: str | PathLike[str]) -> None:
-        self.source = checkpoints.resolve(source)
-        self.read: dict[str, Any] = {}
-
-    def network(self, normals: np.ndarray | None = None, scanned: bool = False) -> Any:
-        """That for a cloud with these normals, see `weights_source`."""
-        meant = str(weights_source(self.source, normals, scanned))
-        if meant not in self.read:
-            self.read[meant] = classical(meant) if meant in CLASSICAL else checkpoints.load(meant)
-        return self.read[meant]
-
-
-def _model(model: Any, normals: np.ndarray | None, scanned: bool) -> tuple[Any, bool]:
+def _model(model: Any, normals: np.ndarray | None, scanned: bool, device: str) -> tuple[Any, bool]:
     """The network or upsampler that is meant, and whether it is the caller's own."""
     if isinstance(model, str | PathLike):
         model = LoadedWeights(model)
     if isinstance(model, LoadedWeights):
-        return model.network(normals, scanned), False
+        return model.network(normals, scanned, device), False
     return model, True
 
 
-def on_device(model: Any, given: bool, device: str) -> tuple[Any, torch.device]:
-    """The network on a device, and which; one that is given and lies elsewhere is copied, not moved."""
-    tensors = [tensor for module in modules_of(model) for tensor in (*module.parameters(False), *module.buffers(False))]
-    if device != "auto":
-        try:
-            torch.empty(0, device=device)
-        except (RuntimeError, AssertionError):
-            raise ValueError(f"device={device}: is not here; expected auto, cpu, or cuda where there is one") from None
-        target = torch.device(device)
-    elif given:
-        target = tensors[0].device if tensors else torch.device("cpu")
-    else:
-        target = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    if all(tensor.device == target for tensor in tensors):
-        return model, target
-    return (copy.deepcopy(model) if given else model).to(target), target
-
-
-def _names(target: torch.device, devices: int) -> list[str]:
+def _names(target: torch.device | str, devices: int) -> list[str]:
     """Of as many devices as are asked for, of the kind of the target."""
-    if devices == 1 or target.type == "cpu":
+    if devices == 1 or str(target).startswith("cpu"):
         return [str(target)] * devices
+    import torch
+
     here = torch.cuda.device_count()
     if devices > here:
         raise ValueError(f"devices={devices}: expected at most {here}, as many CUDA devices as are here")
     return [f"cuda:{number}" for number in range(devices)]
 
 
-def _digest(network: Any, sparse: Tensor, count: int, upsampler: object, *options: object) -> str:
+def _digest(network: Any, sparse: np.ndarray, count: int, upsampler: object, *options: object) -> str:
     """Of all that the parts of a computation depend on."""
-    digest = hashlib.sha256(sparse.numpy().tobytes())
-    for name, value in network.state_dict().items() if modules_of(network) else ():
-        digest.update(name.encode() + value.cpu().numpy().tobytes())
+    digest = hashlib.sha256(sparse.tobytes())
+    for name, value in network.state_dict().items() if hasattr(network, "state_dict") else ():
+        digest.update(name.encode() + (value.cpu().numpy() if is_tensor(value) else value).tobytes())
+    torch = torch_if_loaded() if modules_of(network) else None
     plain = [
         (name, value)
-        for module in (upsampler, *modules_of(network))
+        for module in (upsampler, *(modules_of(network) or [network]))
         for name, value in sorted(vars(module).items())
         if name != "training" and isinstance(value, int | float | str)
     ]
-    digest.update(repr((type(network).__name__, count, options, plain, __version__, torch.__version__)).encode())
+    versions = __version__, torch and torch.__version__
+    digest.update(repr((type(network).__name__, count, options, plain, versions)).encode())
     return digest.hexdigest()[:16]
 
 
-def _prepare(cloud: Cloud, progress: Progress, *, refine: bool = False) -> tuple[Tensor, Frame]:
+def _prepare(cloud: Cloud, progress: Progress, *, refine: bool = False) -> tuple[np.ndarray, Frame]:
     """The points in a fixed order with normals, (n, 6) float64 in the unit sphere, and the way back.
 
     refine: normals that are missing are found by the surface model, not left to a network that does so itself.
     """
     order = np.lexsort(cloud.points.T)
     unit, frame = _unit_sphere(cloud.points[order])
-    given = None if cloud.normals is None else torch.from_numpy(cloud.normals[order])
-    missing = torch.ones(len(order), dtype=torch.bool) if given is None else given.isnan().any(1)
+    given = None if cloud.normals is None else cloud.normals[order]
+    missing = np.ones(len(order), bool) if given is None else np.isnan(given).any(1)
     if missing.any():
         progress("normals", 0, 1)
-        directions = complete_normals(unit[0], given)
+        directions = complete_normals(unit, given)
         if refine:
-            directions = torch.where(missing[:, None], learned_normals(unit[0], directions, progress), directions)
+            directions = np.where(missing[:, None], learned_normals(unit, directions, progress), directions)
         progress("normals", 1, 1)
     else:
         assert given is not None
         directions = given
-    return torch.cat([unit[0], directions], 1), frame
+    return np.hstack([unit, directions]), frame
 
 
-def _unit_sphere(points: np.ndarray) -> tuple[Tensor, Frame]:
-    """Points (n, 3) as (1, n, 3) in the unit sphere, and the way back."""
-    cloud = torch.from_numpy(points)[None]
-    frame = unit_sphere_frame(cloud)
-    unit = frame.to_unit(cloud)
-    extent = torch.linalg.svdvals(unit[0] - unit[0].mean(0))
-    if extent[1] < 1e-9 * extent[0]:
-        raise ValueError(f"points: all {len(points)} points lie on a line; expected points on a surface")
+def _unit_sphere(points: np.ndarray) -> tuple[np.ndarray, Frame]:
+    """Points (n, 3) in the unit sphere, and the way back."""
+    frame = unit_sphere_frame(points)
+    unit = frame.to_unit(points)
+    check_not_a_line(unit)
     return unit, frame

@@ -4,9 +4,10 @@ import json
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from torch import Tensor
+if TYPE_CHECKING:
+    from torch import Tensor
 
 FOLDER = Path(__file__).parent
 SUFFIX = ".safetensors"
@@ -18,7 +19,7 @@ class Weights(NamedTuple):
 
     model: dict[str, Any]  # what `networks.build_network` takes
     patch_size: int | None  # points of the patches that it was trained on; None: the network's default
-    state: dict[str, Tensor]
+    state: dict[str, Any]  # tensors, or arrays
 
 
 def shipped_names() -> list[str]:
@@ -34,8 +35,8 @@ def find(source: str | PathLike[str]) -> Path | None:
     return path if path.suffix == SUFFIX and path.is_file() else None
 
 
-def read(path: str | PathLike[str]) -> Weights:
-    """The network that a file holds.
+def read(path: str | PathLike[str], kind: Literal["pt", "numpy"] = "pt") -> Weights:
+    """The network that a file holds, as tensors or as arrays, which need no torch.
 
     Raises:
         ValueError: the file is broken, or not one that `write` made.
@@ -43,7 +44,7 @@ def read(path: str | PathLike[str]) -> Weights:
     from safetensors import SafetensorError, safe_open
 
     try:
-        with safe_open(path, "pt") as file:
+        with safe_open(path, kind) as file:
             metadata = file.metadata() or {}
             config, patch_size = (json.loads(metadata.get(name, "null")) for name in ("model", "patch_size"))
             state = {name: file.get_tensor(name) for name in sorted(file.keys())}
@@ -59,7 +60,7 @@ def read(path: str | PathLike[str]) -> Weights:
 
 
 def write(
-    path: str | PathLike[str], model: Mapping[str, Any], state: Mapping[str, Tensor], patch_size: int | None = None
+    path: str | PathLike[str], model: Mapping[str, Any], state: Mapping[str, "Tensor"], patch_size: int | None = None
 ) -> None:
     """Write a network, atomically."""
     from safetensors.torch import save

@@ -46,7 +46,7 @@ def test_jets_are_exact_on_their_own_surfaces() -> None:
     true = np.column_stack([-0.6 * xy, np.ones(400)])
     true /= np.linalg.norm(true, axis=1, keepdims=True)
     jets = normal_scores(jet_normals(points, 24)[0].numpy(), true)
-    planes = normal_scores(estimate_normals(points, 24, orient=False)[0].numpy(), true)
+    planes = normal_scores(estimate_normals(points[0].numpy(), 24, orient=False), true)
     assert jets["unoriented_rms_deg"] < 0.2 * planes["unoriented_rms_deg"]
     plane = torch.from_numpy(np.column_stack([xy, xy @ [0.5, -1]]))[None]
     normal = torch.nn.functional.normalize(torch.tensor([-0.5, 1, 1], dtype=torch.float64), dim=0)

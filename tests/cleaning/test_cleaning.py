@@ -17,7 +17,7 @@ from pnu.geometry.anisotropy import averaged, evenness, thinned_lines
 from pnu.geometry.mesh_sampling import sample_area
 from pnu.geometry.outlier_features import FEATURES, NEIGHBORS, outlier_features
 from pnu.io import Cloud, read_cloud
-from pnu.upsamplers.whole_clouds import weights_source
+from pnu.upsamplers.inference import weights_source
 
 
 def sphere(n: int, seed: int = 0) -> np.ndarray:

@@ -44,7 +44,7 @@ def network(width: int, *, sphere: bool = True, attention: bool = True) -> Surfa
 def assert_same_step(surface: Surface, query: Tensor, cloud: Tensor, idx: Tensor) -> None:
     compiled = compiled_projection(surface)
     assert compiled is not None
-    found = compiled(query, cloud, idx)
+    found = torch.from_numpy(compiled(query.numpy(), cloud.numpy(), idx.numpy()))
     projected, log_error, spacing = surface.project(query[None], cloud[None], idx[None])
     torch.testing.assert_close(found[:, :3], projected[0, :, :3], rtol=0, atol=1e-6)
     torch.testing.assert_close(found[:, 3:6], projected[0, :, 3:], rtol=0, atol=1e-5)
@@ -102,7 +102,8 @@ def assert_same_feet(query: Tensor, cloud: Tensor, idx: Tensor, tolerance: float
     offsets = (cloud[idx][..., :3] - query[:, None, :3]).float()
     step, normal = feet(offsets, near[..., 3:], query[:, 3:].float())
     expected = torch.cat([query[:, :3] + step, normal, torch.zeros(len(query), 1)], 1)
-    torch.testing.assert_close(compiled(query, cloud, idx), expected, rtol=0, atol=tolerance)
+    found = torch.from_numpy(compiled(query.numpy(), cloud.numpy(), idx.numpy()))
+    torch.testing.assert_close(found, expected, rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize("change", ["another class", "float64", "PNU_FAST=0"])

@@ -6,10 +6,11 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pnu.geometry import farthest_sampling
 from pnu.geometry import sampling as module
+from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.sampling import (
     farthest_points,
-    farthest_points_large,
     nonuniform_points,
     poisson_disk_points,
     random_points,
@@ -38,8 +39,8 @@ def path(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Non
         request.getfixturevalue("compiled")
     else:
         monkeypatch.setenv("PNU_FAST", "0")
-        monkeypatch.setattr(module, "NEAR_BLOCK", 16)
-        monkeypatch.setattr(module, "BLOCKS_PAY", 0 if request.param == "near blocks" else 2**62)
+        monkeypatch.setattr(farthest_sampling, "NEAR_BLOCK", 16)
+        monkeypatch.setattr(farthest_sampling, "BLOCKS_PAY", 0 if request.param == "near blocks" else 2**62)
 
 
 @pytest.mark.usefixtures("path")
@@ -86,7 +87,7 @@ def test_all_ways_choose_the_same(n: int) -> None:
     for start in (0, 1, n // 2, n - 1):
         fast = farthest_points(points, 200, start=start)
         assert torch.equal(fast, module._farthest_steps(points, 200, torch.tensor([start]), False))
-        np.testing.assert_array_equal(fast[0], module._farthest_near(points[0].numpy(), 200, start))
+        np.testing.assert_array_equal(fast[0], farthest_sampling._farthest_near(points[0].numpy(), 200, start))
 
 
 def test_one_start_for_each_cloud() -> None:

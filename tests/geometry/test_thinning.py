@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-import torch
 from scipy.spatial import cKDTree
 
-from pnu.geometry import sampling
+from pnu.geometry import farthest_sampling
 from pnu.geometry.farthest_blocks import farthest_in_blocks
-from pnu.geometry.sampling import farthest_points_large
+from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.spatial_blocks import along_curve, split_blocks
 
 SIZE = 2**12  # of a block
@@ -19,7 +18,7 @@ def sphere(n: int, seed: int = 0) -> np.ndarray:
 
 
 def choose(points: np.ndarray, m: int) -> np.ndarray:
-    return sampling._farthest(points, m, 0)
+    return farthest_sampling.farthest_order(points, m, 0)
 
 
 def spacing(chosen: np.ndarray) -> np.ndarray:
@@ -102,9 +101,9 @@ def test_repeated_points() -> None:
 def test_large_clouds_take_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     points = sphere(10_000)
     exact = farthest_points_large(points, 3000)
-    monkeypatch.setattr(sampling, "LARGE", 5000)
+    monkeypatch.setattr(farthest_sampling, "LARGE", 5000)
     monkeypatch.setattr("pnu.geometry.farthest_blocks.BLOCK", SIZE)
-    chosen = farthest_points_large(torch.from_numpy(points).double() + 1e6, 3000)
+    chosen = farthest_points_large(points.astype(np.float64) + 1e6, 3000)
     assert len(np.unique(chosen)) == 3000
     assert spacing(points[chosen]).mean() == pytest.approx(spacing(points[exact]).mean(), rel=0.01)
     np.testing.assert_array_equal(farthest_points_large(points, 100), exact[:100])  # too few for blocks
@@ -120,10 +119,10 @@ def test_the_way_is_told() -> None:
 
 
 def test_near_along_the_curve_is_near_in_space() -> None:
-    points = torch.from_numpy(sphere(20_000)).double() * 7 + 1e5
+    points = sphere(20_000).astype(np.float64) * 7 + 1e5
     order = along_curve(points)
-    assert torch.equal(order.sort().values, torch.arange(len(points)))
-    steps = points[order].diff(dim=0).norm(dim=1)
+    np.testing.assert_array_equal(np.sort(order), np.arange(len(points)))
+    steps = np.linalg.norm(np.diff(points[order], axis=0), axis=1)
     apart = cKDTree(points).query(points, k=2)[0][:, 1].mean()
-    assert steps.median() < 3 * apart  # of a random order: about 7
-    torch.testing.assert_close(along_curve(points[:1].expand(5, 3)), torch.arange(5))
+    assert np.median(steps) < 3 * apart  # of a random order: about 7
+    np.testing.assert_array_equal(along_curve(points[:1].repeat(5, 0)), np.arange(5))

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from pnu.geometry import sampling
+from pnu.geometry import farthest_sampling
 from pnu.geometry.point_tree import PointTree
+from pnu.geometry.sampling import farthest_points
 
 KINDS = ("random", "plane", "line", "equal", "repeated", "far", "lattice", "clusters")
 Points = np.ndarray
@@ -82,12 +83,12 @@ def test_a_tree_without_kernels_finds_the_same(monkeypatch: pytest.MonkeyPatch, 
 def test_farthest_points_are_those_of_plain_steps(monkeypatch: pytest.MonkeyPatch, n: int, kind: str) -> None:
     points = cloud(kind, n).astype(np.float32)
     for m in {1, max(n // 2, 1), n}:
-        found = sampling._farthest(points, m, n // 3)
-        np.testing.assert_array_equal(found, sampling._farthest_plain(points, m, n // 3))
+        found = farthest_sampling.farthest_order(points, m, n // 3)
+        np.testing.assert_array_equal(found, farthest_sampling._farthest_plain(points, m, n // 3))
         assert len(set(found)) == m
-    monkeypatch.setattr(sampling, "NEAR_BLOCK", 50)
+    monkeypatch.setattr(farthest_sampling, "NEAR_BLOCK", 50)
     np.testing.assert_array_equal(
-        sampling._farthest_near(points, n // 2 + 1, 0), sampling._farthest(points, n // 2 + 1, 0)
+        farthest_sampling._farthest_near(points, n // 2 + 1, 0), farthest_sampling.farthest_order(points, n // 2 + 1, 0)
     )
 
 
@@ -95,9 +96,9 @@ def test_farthest_points_are_those_of_plain_steps(monkeypatch: pytest.MonkeyPatc
 def test_farthest_points_of_several_threads() -> None:
     clouds = [cloud("random", n).astype(np.float32) for n in (3000, 2000, 1000)]
     with ThreadPoolExecutor(3) as pool:
-        found = list(pool.map(lambda points: sampling._farthest(points, 500, 0), clouds))
+        found = list(pool.map(lambda points: farthest_sampling.farthest_order(points, 500, 0), clouds))
     for points, idx in zip(clouds, found, strict=True):
-        np.testing.assert_array_equal(idx, sampling._farthest(points, 500, 0))
+        np.testing.assert_array_equal(idx, farthest_sampling.farthest_order(points, 500, 0))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -112,6 +113,6 @@ def test_what_is_not_finite_is_refused_or_chosen_from_plainly(value: float) -> N
     for k in (0, 201):
         with pytest.raises(ValueError, match=rf"k: expected 1 to 200 neighbors, found {k}"):
             PointTree(points).nearest(points, k)
-    chosen = sampling.farthest_points(torch.from_numpy(bad)[None].float(), 20)
+    chosen = farthest_points(torch.from_numpy(bad)[None].float(), 20)
     assert chosen.shape == (1, 20)
     assert ((chosen >= 0) & (chosen < 200)).all()

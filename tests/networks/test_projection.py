@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
@@ -19,6 +20,14 @@ from pnu.upsamplers.surface_projection import approached, reject_worst
 
 def upsample(network: Surface, cloud: Tensor, count: int, **options: Any) -> Tensor:
     return SurfaceProjection(network).upsample_cloud(cloud, count, Context(**options))
+
+
+def discs(points: Tensor, normals: Tensor, count: int, **options: int) -> Tensor:
+    return torch.from_numpy(tangent_discs(points.numpy(), normals.numpy(), count, **options))
+
+
+def repelled(points: Tensor, normals: Tensor, **options: int) -> Tensor:
+    return torch.from_numpy(repel(points.double().numpy(), normals.double().numpy(), **options)).to(points)
 
 
 def sphere(n: int, seed: int = 0) -> Tensor:
@@ -89,7 +98,7 @@ def test_tangent_basis_is_orthonormal_for_every_axis() -> None:
 def test_discs_lie_in_tangent_planes_and_reach_the_ranked_neighbor() -> None:
     cloud = wavy(300)
     points, normals = cloud[:, :3], cloud[:, 3:]
-    seeds = tangent_discs(points, normals, 9, rank=5)
+    seeds = discs(points, normals, 9, rank=5)
     away = seeds - points[:, None]
     torch.testing.assert_close((away * normals[:, None]).sum(-1), torch.zeros(300, 9, dtype=torch.float64))
     reach = torch.cdist(points, points).sort(dim=1).values[:, 5]
@@ -102,13 +111,13 @@ def test_seeds_fill_a_hole_between_the_points() -> None:
     ring = torch.linspace(0, 2 * torch.pi, 25, dtype=torch.float64)[:-1]
     points = torch.stack([ring.cos(), ring.sin(), torch.zeros_like(ring)], 1)
     normals = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand_as(points)
-    seeds = tangent_discs(points, normals, 40, rank=20).flatten(0, 1)
+    seeds = discs(points, normals, 40, rank=20).flatten(0, 1)
     assert seeds.norm(dim=1).min() < 0.1
 
 
 def test_repulsion_evens_out_a_sphere() -> None:
     cloud = sphere(1500)
-    even_spacing = repel(cloud[:, :3], cloud[:, 3:], steps=10)
+    even_spacing = repelled(cloud[:, :3], cloud[:, 3:], steps=10)
 
     def unevenness(points: Tensor) -> float:
         near = torch.cdist(points, points).topk(2, largest=False).values[:, 1]
@@ -123,8 +132,8 @@ def test_repulsion_leaves_the_two_sides_of_a_sheet_alone() -> None:
     side = torch.cat([grid, torch.zeros(64, 1)], 1)
     points = torch.cat([side, side + torch.tensor([0.1, 0, 1e-3])])
     up = torch.tensor([0.0, 0, 1]).expand(64, 3)
-    alone, both = repel(side, up, steps=1), repel(points, torch.cat([up, -up]), steps=1)
-    pushed = repel(points, torch.cat([up, up]), steps=1)
+    alone, both = repelled(side, up, steps=1), repelled(points, torch.cat([up, -up]), steps=1)
+    pushed = repelled(points, torch.cat([up, up]), steps=1)
     assert (both[:64] - side).norm(dim=1).max() <= (alone - side).norm(dim=1).max() + 0.2
     assert (pushed[:64] - side).norm(dim=1).median() > 3 * (both[:64] - side).norm(dim=1).median() + 1e-3
 
@@ -239,13 +248,14 @@ def test_parts_can_be_left_out() -> None:
 
 def test_most_doubtful_points_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     model, cloud = trained(), wavy(300)
-    every = {}
+    every: dict[str, tuple[Tensor, Tensor]] = {}
     model.reject = 0.01
     project = procedure.in_parts
 
-    def spy(*clouds: Any, **options: Any) -> tuple[Tensor, Tensor]:
-        every["last"] = project(*clouds, **options)
-        return every["last"]
+    def spy(*clouds: Any, **options: Any) -> Any:
+        found = project(*clouds, **options)
+        every["last"] = torch.from_numpy(found[0]), torch.from_numpy(found[1])
+        return found
 
     monkeypatch.setattr(procedure, "in_parts", spy)
     monkeypatch.setattr(SurfaceProjection, "covering", lambda self, query, *others: query)
@@ -265,13 +275,13 @@ def test_of_doubtful_neighbors_the_worst_is_dropped() -> None:
     grid = torch.stack([x, y, torch.zeros_like(x)], -1).flatten(0, 1)
     error = torch.zeros(400)
     error[105:110], error[300] = torch.tensor([7.0, 8.0, 9.0, 8.5, 7.5]), 5.0
-    stays = reject_worst(grid, error, 398)
+    stays = torch.from_numpy(reject_worst(grid.double().numpy(), error.numpy(), 398))
     assert sorted(set(range(400)) - set(stays.tolist())) == [107, 300]
 
 
 @pytest.mark.parametrize("count", [0, 1, 5, 19, 20])
 def test_count_is_exact_however_many_are_dropped(count: int) -> None:
-    stays = reject_worst(sphere(20)[:, :3], torch.arange(20.0).flip(0), count)
+    stays = torch.from_numpy(reject_worst(sphere(20)[:, :3].numpy(), np.arange(20.0)[::-1], count))
     assert len(stays) == count
     assert stays.equal(stays.unique())
 
@@ -279,11 +289,11 @@ def test_count_is_exact_however_many_are_dropped(count: int) -> None:
 def test_the_nearest_comes_to_a_bare_point() -> None:
     points = torch.stack([torch.arange(20.0), torch.zeros(20), torch.zeros(20)], 1).double()  # spacing 2 in the middle
     cloud = torch.cat([points[:10] + torch.tensor([0.0, 0.1, 0.0]), points[13:]])
-    rows, places = approached(cloud, cloud[:0], points)
+    rows, places = approached(cloud.numpy(), cloud[:0].numpy(), points.numpy())
     # 13 comes to nine tenths of half a spacing from 11, the barest; 9 comes nearer to 10
     assert rows.tolist() == [10, 9]
-    torch.testing.assert_close((places[0] - points[11]).norm(), torch.tensor(0.9).double())
-    assert approached(cloud, points[11:13], points)[0].tolist() == []
+    assert np.linalg.norm(places[0] - points[11].numpy()) == pytest.approx(0.9)
+    assert approached(cloud.numpy(), points[11:13].numpy(), points.numpy())[0].tolist() == []
 
 
 def test_some_crops_in_training_get_normals_of_the_network_s_own() -> None:
@@ -348,7 +358,7 @@ def test_training_seeds_are_spread_and_pushed_outward() -> None:
     assert seeds.shape == push.shape == (1, 20, 6)
     assert (push[..., 3:] == 0).all()
     apart = torch.cdist(seeds[0, :, :3], seeds[0, :, :3]).fill_diagonal_(torch.inf).amin(1)
-    all_discs = tangent_discs(patch[0, :, :3], patch[0, :, 3:], 3, first=20).flatten(0, 1)
+    all_discs = discs(patch[0, :, :3], patch[0, :, 3:], 3, first=20).flatten(0, 1)
     crowded = torch.cdist(all_discs, all_discs).fill_diagonal_(torch.inf).amin(1)
     assert apart.min() > 2 * crowded.min()
     parents = seeds[0, :, :3] - push[0, :, :3] / 0.1
@@ -363,11 +373,11 @@ def test_more_seeds_than_a_crop_can_bear_are_refused() -> None:
 
 
 def test_every_stage_of_a_large_run_moves(monkeypatch: pytest.MonkeyPatch) -> None:
-    from pnu.geometry import even_spacing, sampling
+    from pnu.geometry import even_spacing, farthest_sampling
 
     monkeypatch.setattr(procedure, "BATCHES", 1)
-    monkeypatch.setattr(sampling, "LARGE", 2000)
-    monkeypatch.setattr(sampling, "LARGE_BLOCK", 1000)
+    monkeypatch.setattr(farthest_sampling, "LARGE", 2000)
+    monkeypatch.setattr(farthest_sampling, "LARGE_BLOCK", 1000)
     monkeypatch.setattr(even_spacing, "ROWS", 1000)
     steps: dict[str, list[tuple[int, int]]] = {}
     upsample(Surface(), sphere(600), 2400, progress=lambda stage, *step: steps.setdefault(stage, []).append(step))

@@ -96,7 +96,7 @@ def test_threads_do_not_matter() -> None:
 
 
 def test_a_failed_part_leaves_no_file(tmp_path: Path) -> None:
-    def fail() -> torch.Tensor:
+    def fail() -> np.ndarray:
         raise Stop
 
     with pytest.raises(Stop):

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from torch import Tensor, nn
+from torch import nn
 
 from pnu.runtime.workers import InProcess, Processes
 from pnu.upsamplers import APSS, surface_projection
@@ -20,15 +19,15 @@ from pnu.upsamplers import patches as procedure
 from pnu.upsamplers.whole_clouds import upsample
 from tests.runtime.test_parts import patches, sphere
 
-CLOUD = torch.arange(12.0, dtype=torch.float64).view(4, 3)
+CLOUD = np.arange(12.0).reshape(4, 3)
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 
-def begin(network: nn.Module, cloud: Tensor) -> Callable[[Tensor], Tensor]:
+def begin(network: nn.Module, cloud: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     return partial(work, cloud)
 
 
-def work(cloud: Tensor, part: Tensor) -> Tensor:
+def work(cloud: np.ndarray, part: np.ndarray) -> np.ndarray:
     """The points of a part, and who did it; negative parts are mishaps."""
     if part[0] == -1:
         raise ValueError("model: is damaged")
@@ -36,12 +35,12 @@ def work(cloud: Tensor, part: Tensor) -> Tensor:
         raise RuntimeError("out of memory\nand more")
     if part[0] == -3:
         os._exit(9)
-    return torch.cat([cloud[part], cloud.new_full((1, 3), os.getpid())])
+    return np.concatenate([cloud[part], np.full((1, 3), os.getpid())])
 
 
 @pytest.mark.slow
 def test_order_errors_and_end() -> None:
-    parts = list(torch.arange(4).split(1))
+    parts = list(np.arange(4).reshape(4, 1))
     with Processes(nn.Identity(), ["cpu", "cpu"]) as workers:
         for cloud in (CLOUD, -CLOUD, CLOUD):
             found = list(workers.map(begin, cloud, parts))
@@ -55,7 +54,7 @@ def test_order_errors_and_end() -> None:
             (-3, "^devices=2: a process ended amid its work; "),
         ):
             with pytest.raises(ValueError, match=message) as error:
-                list(workers.map(begin, CLOUD, [*parts, torch.tensor([number]), *parts]))
+                list(workers.map(begin, CLOUD, [*parts, np.array([number]), *parts]))
             assert "\n" not in str(error.value)
     assert not any(alive(pid) for pid in pids)
 

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 import pnu
 from pnu.commands.upsample import main
-from pnu.geometry.sampling import farthest_points_large
+from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.io import read_cloud
 from pnu.upsamplers.density import count_of_spacing, groups_of_like_spacing, point_counts
 

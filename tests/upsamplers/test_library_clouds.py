@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 import torch
 
-from pnu import PointCloudUpsampler, upsample
+from pnu import PointCloudUpsampler, upsample, weights
 from pnu.io.library_clouds import KINDS, kind_of
-from pnu.networks import checkpoints
 from pnu.upsamplers import whole_clouds
 from pnu.upsamplers.whole_clouds import normals
 from tests.upsamplers.test_inference import Spread, sphere
@@ -240,8 +239,8 @@ def test_the_types_that_editors_see_are_those_of_the_function(function: Any) -> 
 
 def test_an_upsampler_reads_its_weights_once(monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[str] = []
-    load = checkpoints.load
-    monkeypatch.setattr(checkpoints, "load", lambda source: read.append(source) or load(source))
+    whole = weights.read
+    monkeypatch.setattr(weights, "read", lambda path, *kind: read.append(Path(path).stem) or whole(path, *kind))
     upsampler = PointCloudUpsampler(ratio=2).fit()
     assert read == ["surface"]
     for _ in range(2):

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from pnu.io import read_cloud, write_cloud
 from pnu.upsamplers import tile_seams, tile_work
 from pnu.upsamplers.tile_plan import Keys, Plan, planned
-from pnu.upsamplers.tile_seams import exactly, pushed_apart
+from pnu.upsamplers.tile_seams import evened_out, exactly
 from pnu.upsamplers.whole_clouds import output_count, ratio_of_spacing, upsample
 
 KEYS = Keys("", 2.5, None, "auto", False, "auto", None, None, None, None, "auto", "auto", "surface")
@@ -87,6 +87,10 @@ def test_borders_have_the_spacing_of_the_inside(tmp_path: Path) -> None:
     np.testing.assert_allclose(border[:, 0].std(), inside[:, 0].std(), rtol=0.2)
     low, usual = (np.quantile(spaces[:, 0], 0.01) for spaces in (border, inside))
     assert low > 0.7 * usual
+    across = home[cKDTree(dense[:, :3]).query(dense[:, :3], k=2)[1]] @ [1, -1] != 0
+    assert across.sum() > 20
+    nearest = cKDTree(dense[:, :3]).query(dense[:, :3], k=2)[0][:, 1]
+    assert nearest[across].min() > nearest[~across].min() > 0.2 * np.median(nearest)
     made = sum(len(np.load(plan.path("made", i))) for i in plan.tiles)
     np.testing.assert_allclose(made, 4800, rtol=0.03)  # so that few are left over
 
@@ -181,12 +185,24 @@ def test_points_push_each_other_apart_and_the_fixed_stay() -> None:
     cloud[[65, 66], 0] += [0.35, -0.35]
     moving = np.array([65, 66])
     order = np.concatenate([moving, np.setdiff1d(np.arange(144), moving)])
-    moved = pushed_apart(cloud[order], 2)
+    moved = evened_out(cloud[order], 2)
     assert moved.shape == (2, 6)
     before, after = (np.linalg.norm(c[0, :3] - c[1, :3]) for c in (cloud[order], moved))
     assert before < 0.31
     assert after > 0.8
     assert (moved[:, 2] == 0).all()
+
+
+def test_points_that_are_added_keep_apart() -> None:
+    """From each other too, and from those of the tile beside."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(0, 15, (225, 2)), np.zeros((225, 3)), np.ones(225)])
+    tile, beside = points[points[:, 0] < 10], points[points[:, 0] >= 10]
+    filled = exactly(tile, 0, len(tile) + 20, beside)
+    everything = np.vstack([filled, beside])[:, :3]
+    nearest = cKDTree(everything).query(filled[len(tile) :, :3], k=2)[0][:, 1]
+    assert len(nearest) == 20
+    assert nearest.min() > 0.5
 
 
 def test_exactly_so_many() -> None:
