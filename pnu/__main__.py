@@ -10,6 +10,19 @@ from pathlib import Path
 from pnu import __version__
 
 COMMANDS = Path(__file__).parent / "commands"
+MEANT = {  # what people call it -> the verbs that do it
+    **dict.fromkeys(("mesh", "surface", "poisson"), ("scan", "reconstruct")),
+    **dict.fromkeys(("densify", "dense", "upscale", "resample", "clean", "denoise", "outliers"), ("upsample", "scan")),
+    **dict.fromkeys(("estimate", "orient"), ("normals",)),
+    **dict.fromkeys(("sweep", "ablation", "multirun", "fit", "finetune"), ("train",)),
+    **dict.fromkeys(("patches", "data", "dataset"), ("prepare",)),
+    **dict.fromkeys(("test", "score", "eval", "metrics", "benchmark"), ("evaluate", "compare")),
+    **dict.fromkeys(("show", "open", "display", "page", "share", "send", "html"), ("view",)),
+    **dict.fromkeys(("plot", "render", "draw", "image", "figure"), ("picture",)),
+    **dict.fromkeys(("gui", "ui", "web", "serve", "browser"), ("app",)),
+    **dict.fromkeys(("check", "info", "install", "setup"), ("doctor",)),
+    **dict.fromkeys(("onnx", "save"), ("export",)),
+}
 BASH = """\
 _pnu() {{
   local keys
@@ -84,6 +97,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Run the verb that argv names, as `python -m pnu.commands.VERB` would, so that processes which start the program
     again (DDP, spawned workers) find it."""
     verb, *rest = [*(sys.argv[1:] if argv is None else argv)] or ["--help"]
+    if verb in ("-h", "--help", "help") and rest and rest[0] in verbs():
+        verb, rest = rest[0], ["--help"]
     if verb in ("-h", "--help", "help"):
         print(overview())
     elif verb == "--version":
@@ -94,8 +109,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         sys.argv = [sys.argv[0], *rest]
         runpy.run_module(f"pnu.commands.{verb}", run_name="__main__", alter_sys=True)
     else:
-        near = difflib.get_close_matches(verb, verbs(), 1, 0)[0]
-        print(f"error: unknown verb '{verb}': did you mean '{near}'? `pnu` lists them", file=sys.stderr)
+        near = MEANT.get(verb.lower()) or difflib.get_close_matches(verb.lower(), verbs(), 1)
+        meant = f"did you mean {' or '.join(f'{other!r}' for other in near)}? " if near else ""
+        print(f"error: unknown verb '{verb}': {meant}`pnu` lists them", file=sys.stderr)
         sys.exit(2)
 
 

@@ -97,6 +97,7 @@ def lay_out(folder: Path, cache: Path) -> None:
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     cloud = sample_area(shapes.make("mug"), 400, np.random.default_rng(0))
     write_cloud(folder / "scan.ply", cloud[:, :3], cloud[:, 3:])
+    write_cloud(folder / "tile.las", cloud[:, :3])
     write_mesh(folder / "mesh.ply", shapes.make("mug"))
     (folder / "meshes").mkdir()
     for name in [*shapes.names()[:3], "mug"]:

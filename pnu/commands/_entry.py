@@ -35,12 +35,13 @@ import functools
 import os
 import sys
 import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from pnu import __version__
+from pnu.commands._arguments import keyed
 from pnu.config import quoting
 from pnu.config.compose import (
     check_keys,
@@ -65,7 +66,8 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
     Args:
         function: gets the checked config; its `ValueError`s and `OSError`s become one line and exit code 2.
         schema: dataclass that documents every key of `conf/<name>.yaml`; `also` of it: other names of keys; `commas`:
-            keys whose values hold commas; `files`: the key of the files that stand alone, as in `pnu view a.ply b.ply`.
+            keys whose values hold commas; `files`: the key of the files that stand alone, as in `pnu view a.ply b.ply`,
+            or keys, one for each; input and output where a command has both.
         name: of the config file; default: the schema's name in lower case.
     """
     name = name or schema.__name__.lower()
@@ -92,11 +94,10 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
 
     def main(argv: Sequence[str] | None = None) -> None:
         # Hydra reads options only before the first override: `a=1 -m b=2` is as good as `-m a=1 b=2`
-        given = [
-            renamed(argument, getattr(schema, "also", {}), getattr(schema, "commas", ()))
-            for argument in (sys.argv[1:] if argv is None else argv)
-        ]
-        given = files_first(given, getattr(schema, "files", None))
+        try:
+            given = keyed(sys.argv[1:] if argv is None else argv, schema)
+        except ValueError as error:
+            stop(error)
         arguments = sorted(given, key=is_override)
         if "--version" in arguments:  # Hydra would tell its own
             print(f"pnu {__version__}")
@@ -256,29 +257,6 @@ def folder_arguments(config: Any, schema: type) -> list[str]:
 def is_override(argument: str) -> bool:
     """Whether an argument sets a key, and is no option."""
     return not argument.startswith("-") and ("=" in argument or argument.startswith("~"))
-
-
-def files_first(given: Sequence[str], key: str | None) -> list[str]:
-    """The arguments, those that are neither an option nor `key=value` as one list of that key."""
-    if key is None:
-        return [*given]
-    alone = [argument for argument in given if not argument.startswith(("-", "~")) and "=" not in argument]
-    alone = [str(Path(argument).expanduser()) for argument in alone]
-    rest = [argument for argument in given if argument.startswith(("-", "~")) or "=" in argument]
-    return [*([quoting.override(key, alone)] if alone else []), *rest]
-
-
-def renamed(argument: str, names: Mapping[str, str], commas: Sequence[str] = ()) -> str:
-    """An argument as Hydra shall see it: the key by its first name, and ~/ expanded, which shells leave after `=`.
-
-    commas: keys whose values hold commas, which would be several values to Hydra.
-    """
-    key, equals, value = argument.partition("=")
-    if key in commas and "," in value and not value.startswith(('"', "'")):
-        value = f'"{value.strip("[] ")}"'
-    if value.startswith("~/"):
-        value = str(Path(value).expanduser())
-    return f"{names.get(key, key)}{equals}{value}"
 
 
 def stop(error: Exception) -> typing.NoReturn:

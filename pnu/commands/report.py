@@ -3,7 +3,7 @@
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from pnu.commands._entry import command
 from pnu.config.schema import doc
@@ -15,6 +15,7 @@ SWEEPS = Path("outputs/sweeps")
 class Report:
     """Compare the settings of a sweep over their seeds: Markdown, CSV and one HTML page."""
 
+    files: ClassVar = ("sweep",)
     sweep: str | None = doc("folder of the sweep; null: the newest below outputs/sweeps")
     baseline: str | None = doc("name of the setting to compare with; null: that of the first job; a search has none")
     output: str | None = doc("folder of the report; null: <sweep>/report")

@@ -53,7 +53,9 @@ def composer(name: str, extra_folder: str | None = None) -> Iterator[Callable[..
             OmegaConf.set_struct(own, True)
             return own
         except MissingConfigException as error:
-            group, _, choice = (error.missing_cfg_file or "?").rpartition("/")
+            missing = error.missing_cfg_file or "?"
+            group, _, choice = missing.removesuffix("/").rpartition("/")
+            choice += missing[len(group) + 1 + len(choice) :]  # data=FOLDER/
             if group in ("hydra/launcher", "hydra/sweeper") and choice in EXTRAS:
                 raise ValueError(f"{group}={choice}: is not here; pip install 'pnu[{EXTRAS[choice]}]'") from None
             known = ", ".join(sorted(error.options or []))

@@ -7,7 +7,7 @@ from typing import Any
 
 from pnu.config.compose import group_choices
 from pnu.config.instantiate import PACKAGES
-from pnu.config.schema import Groups, class_arguments, fields, groups, library, nested_class, settable
+from pnu.config.schema import Groups, class_arguments, fields, file_keys, groups, library, nested_class, settable
 from pnu.config.signature import Argument, arguments, summary
 
 
@@ -49,7 +49,9 @@ def help_text(schema: type, program: str, cfg: Any) -> str:
     """What a command does, and for every key its present value and its line of documentation."""
     from omegaconf import OmegaConf
 
-    usage = f"usage: {program} [key=value ...]      (-m key=a,b: one run for each value)"
+    keys = file_keys(schema)
+    alone = f"[{keys.upper()} ...] " if isinstance(keys, str) else "".join(f"[{key.upper()}] " for key in keys)
+    usage = f"usage: {program} {alone}[key=value ...]      (-m key=a,b: one run for each value)"
     lines = [usage, "", inspect.getdoc(schema) or "", ""]
     kinds = groups(schema)
     # groups last: keys of the command itself below a group would look like the group's

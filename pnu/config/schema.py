@@ -55,6 +55,14 @@ def fields(schema: type) -> dict[str, dataclasses.Field[Any]]:
     return {field.name: field for field in dataclasses.fields(schema)}
 
 
+def file_keys(schema: type) -> str | tuple[str, ...]:
+    """The keys that names of files standing alone are given to, or the key of the list of them: `files` of a schema."""
+    if {"input", "output"} <= fields(schema).keys():
+        return "input", "output"
+    found: str | tuple[str, ...] = getattr(schema, "files", ())
+    return found
+
+
 def groups(schema: type) -> dict[str, type[Group]]:
     """The groups among a command's keys."""
     hints = typing.get_type_hints(schema)
@@ -274,8 +282,18 @@ def check_arguments(
 
 
 def no_use(group: str, key: str) -> str:
-    """Why a key that the class would take means nothing here."""
-    return f"key '{key}' has no use with this {group}: --help shows the keys that do"
+    """Why a key that another class of the group takes means nothing here, and with which choices it does."""
+    having = [
+        choice
+        for choice, named in targets(group).items()
+        for name, target in named.items()
+        for inner, _ in settable(group, class_arguments(group, target))
+        if key == ".".join(filter(None, (group, name, inner)))
+    ]
+    cure = (
+        f"it is one of {' or '.join(f'{group}={choice}' for choice in having)}" if having else "--help shows its keys"
+    )
+    return f"key '{key}' has no use with this {group}: {cure}"
 
 
 @functools.cache

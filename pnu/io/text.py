@@ -10,22 +10,25 @@ import numpy as np
 
 def open_file(path: Path, content: str, suffixes: Iterable[str]) -> str:
     """The lower-case suffix of an existing file that is not empty; `ValueError` otherwise."""
-    suffix = known_suffix(path, content, suffixes)
     if path.is_dir():
         raise ValueError(f"{path}: is a folder; give the file of a {content}")
+    if path.suffix or path.is_file():
+        known_suffix(path, content, suffixes)
     if not path.is_file():
         raise ValueError(f"{path}: no such file; give the path of a {content}")
     if not path.stat().st_size:
         raise ValueError(f"{path}: the file is empty; expected a {content}")
-    return suffix
+    return path.suffix.lower()
 
 
 def known_suffix(path: Path, content: str, suffixes: Iterable[str]) -> str:
     """The suffix of a path, in lower case; `ValueError` names those that are known."""
     suffix = path.suffix.lower()
     if suffix not in suffixes:
-        found = f"the suffix '{path.suffix}'" if path.suffix else "no suffix"
-        raise ValueError(f"{path}: {found} is not a format of a {content}; use one of {' '.join(sorted(suffixes))}")
+        wrong = f"the suffix '{path.suffix}' is not a format of a {content}" if path.suffix else "has no suffix"
+        if path.is_dir():
+            wrong = f"is a folder; give the name of a {content}"
+        raise ValueError(f"{path}: {wrong}; use one of {' '.join(sorted(suffixes))}")
     return suffix
 
 

@@ -61,8 +61,12 @@ def open3d_error() -> str | None:
 def main() -> None:
     """`pnu doctor`."""
     arguments = sys.argv[1:]
-    if set(arguments) - OPTIONS:
-        sys.exit(__doc__)
+    if {"--help", "-h"} & {*arguments}:
+        print(__doc__)
+        return
+    if unknown := sorted({*arguments} - OPTIONS):
+        print(f"error: unknown option {unknown[0]}: expected {', '.join(sorted(OPTIONS))}", file=sys.stderr)
+        sys.exit(2)
     missing = missing_packages()
     if missing and "--install" in arguments and "--no-system" not in arguments and install(missing):
         missing = missing_packages()

@@ -87,7 +87,14 @@ def test_all_is_there(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
     assert capsys.readouterr().out == "open3d and the system libraries it needs are here.\n"
 
 
-def test_other_arguments_print_the_help(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["doctor", "--instal"])
-    with pytest.raises(SystemExit, match="--install"):
+def test_help_is_an_answer_and_another_option_an_error(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["pnu", "--help"])
+    system_libraries.main()
+    assert "--no-system" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", ["pnu", "--instal"])
+    with pytest.raises(SystemExit) as stop:
         system_libraries.main()
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.startswith("error: unknown option --instal: expected --install, --no-system, ")

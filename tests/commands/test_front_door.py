@@ -6,7 +6,8 @@ import sys
 
 import pytest
 
-from pnu.__main__ import completion, main, verbs
+from pnu.__main__ import MEANT, completion, main, verbs
+from tests.refusals import refused
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -25,6 +26,20 @@ def test_a_mistyped_verb_is_one_line() -> None:
     done = run("upsamle", "input=x.ply")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "error: unknown verb 'upsamle': did you mean 'upsample'? `pnu` lists them\n"
+
+
+def test_other_words_for_a_verb_lead_to_it(capsys: pytest.CaptureFixture[str]) -> None:
+    assert {verb for meant in MEANT.values() for verb in meant} <= verbs().keys()
+    assert not MEANT.keys() & verbs().keys()
+    assert refused(capsys, main, ["mesh", "scan.ply"]).startswith("error: unknown verb 'mesh': did you mean 'scan' or")
+    assert refused(capsys, main, ["page"]) == "error: unknown verb 'page': did you mean 'view'? `pnu` lists them"
+    assert refused(capsys, main, ["frobnicate"]) == "error: unknown verb 'frobnicate': `pnu` lists them"
+
+
+@pytest.mark.parametrize("word", ["help", "--help"])
+def test_help_on_a_verb_may_be_asked_first(word: str) -> None:
+    done = run(word, "scan")
+    assert done.stdout.startswith("usage: pnu scan [INPUT] [OUTPUT] [key=value ...]"), done.stderr
 
 
 def test_the_module_that_trains_and_the_verb_are_one() -> None:

@@ -79,7 +79,10 @@ def test_what_an_overlay_says_to_another_schedule_is_left_out() -> None:
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["data=patches", "data.patches=3"], r"key 'data\.patches' has no use with this data"),
+        (
+            ["data=patches", "data.patches=3"],
+            r"key 'data\.patches' has no use with this data: it is one of data=meshes or",
+        ),
         (["scale=small", "data=surface", "data.input_points=64"], r"key 'data\.input_points' has no use"),
         (["setting=features/no_local", "model=punet"], r"key 'model\.local_features' has no use with this model"),
     ],

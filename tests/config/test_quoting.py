@@ -136,7 +136,7 @@ PLACES = {
     "training/resuming.py open_run": "test_a_finished_run_that_lost_its_last_checkpoint",
     "training/sweeps.py closing_line": "test_a_sweep_then_its_report",
     "training/sweeps.py run": "test_interrupted_with_a_launcher",  # in test_sweep.py
-    "commands/_entry.py files_first": "test_files_of_awkward_names_stand_alone",  # in test_view.py
+    "commands/_arguments.py of_files": "test_files_of_awkward_names_stand_alone",  # in test_view.py
     "commands/_worker.py read_and_clean": "test_the_browser_gets_what_the_command_writes",  # in test_app.py
     "commands/_worker.py write_file": "test_the_browser_gets_what_the_command_writes",
     "app/sessions.py start_making": "test_the_browser_gets_what_the_command_writes",

@@ -14,7 +14,8 @@ import pytest
 from omegaconf import OmegaConf
 
 import pnu
-from pnu.commands._entry import command, renamed
+from pnu.commands._arguments import renamed
+from pnu.commands._entry import command
 from pnu.commands.compare import Compare
 from pnu.commands.train import Train
 from pnu.commands.train import main as train

@@ -27,7 +27,7 @@ ROWS = "\n".join(f"{i} {i % 4} {i % 5}" for i in range(20))
 BAD_CLOUDS = {
     "empty.xyz": (b"", "the file is empty; expected a point cloud"),
     "suffix.foo": (b"1", r"suffix '.foo' is not a format of a point cloud; use one of .asc .csv .e57 .glb"),
-    "plain": (b"1", "no suffix is not a format of a point cloud"),
+    "plain": (b"1", "plain: has no suffix; use one of .asc .csv"),
     "words.xyz": (ROWS.replace("7 3 2", "seven 3 2").encode(), "line 8: expected numbers, found 'seven'"),
     "names.txt": (f"a b c\n{ROWS}".encode(), r"expected points with x y z, found a b c; say .*columns=x,y,z"),
     "ragged.xyz": (f"{ROWS}\n1 2".encode(), "line 21 has 2 columns, those before have 3"),
