@@ -80,6 +80,7 @@ def downloaded(page: Page, folder: Path, name: str, kind: str) -> Path:
 
 @needs_browser
 @pytest.mark.slow
+@pytest.mark.usefixtures("compiled")  # compiled or not, results are the same to rounding, not to the bit
 def test_the_browser_gets_what_the_command_writes(tmp_path: Path) -> None:
     scan = tmp_path / "a scan.ply"
     write_scan(scan)

@@ -135,7 +135,7 @@ def test_every_experiment_runs_a_step(overlay: str, source: str, patches: Path, 
     cfg = compose_config(Train, [overlay, *([] if source == "own" else [f"data={source}"])])
     if "clouds" in cfg.data:
         options += ["data.validation=[gear]", "data.clouds=8", "data.size=96", "data.points=128", "model=surface"]
-        options += ["loss=surface"]
+        options += ["loss=surface", *(["weights=null"] if cfg.weights == "previous" else [])]
     else:
         options += ["model=pnu", "loss=compound", "data.input_points=64", "data.target_points=256"]
         options += (

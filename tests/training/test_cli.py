@@ -271,9 +271,14 @@ def test_nodes_of_slurm_train_as_one(tmp_path: Path, small: list[str]) -> None:
         start(tmp_path, *line, *nodes, f"run={tmp_path / 'slurm'}", **job, SLURM_PROCID=rank, SLURM_NODEID=rank)
         for rank in "01"
     ]
-    for task in tasks:
-        error = task.communicate(timeout=300)[1]
-        assert task.returncode == 0, error
+    try:
+        for task in tasks:
+            error = task.communicate(timeout=600)[1]
+            assert task.returncode == 0, error
+    finally:
+        for task in tasks:  # one that has failed leaves the other waiting
+            task.kill()
+            task.communicate()
     together = ["trainer.devices=2", "trainer.strategy=ddp", f"run={tmp_path / 'two'}"]
     assert train(tmp_path, *line, *together).returncode == 0
     np.testing.assert_allclose(curve(tmp_path / "slurm"), curve(tmp_path / "two"), rtol=1e-6)
