@@ -25,7 +25,7 @@ from pnu import weights
 from pnu.benchmark import cost
 from pnu.extras import EXTRAS, MissingExtra, needed, require
 from pnu.kernels import compilation
-from pnu.runtime import system_libraries
+from pnu.runtime import system_libraries, threads
 from pnu.training import sweeps
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -143,7 +143,7 @@ KNOWN = {  # each with a fallback, which a test here runs, or a test of its own
     ("kernels/compilation.py", "import fcntl"): "ImportError",
     ("kernels/compilation.py", "os.nice"): "AttributeError",
     ("benchmark/cost.py", "import resource"): "ImportError",
-    ("data/patch_module.py", "os.sched_getaffinity"): "hasattr",
+    ("runtime/threads.py", "os.sched_getaffinity"): "hasattr",
     ("io/las_child.py", "import resource"): "ImportError",
     ("io/e57_child.py", "import resource"): "ImportError",
     **dict.fromkeys((("app/jobs.py", "os.killpg"), ("app/jobs.py", "signal.SIGKILL")), 'hasattr(os, "killpg")'),
@@ -177,6 +177,8 @@ def test_calls_that_only_posix_has_have_a_fallback(tmp_path: Path, monkeypatch: 
     assert compilation._taken(None, wait=False)
     monkeypatch.setattr(cost, "resource", None)
     assert len(cost.children()) == 2
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert threads.processor_count() == os.cpu_count()
     monkeypatch.delattr(os, "geteuid")
     assert not system_libraries.install(["libgl1"])
 

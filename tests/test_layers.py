@@ -315,5 +315,6 @@ def test_only_pictures_and_reports_load_matplotlib(tmp_path: Path) -> None:
     assert "matplotlib" in loaded_by("from pnu.report import plots; plots.plot('', [print])")
 
 
+@pytest.mark.slow
 def test_heavy_import_would_be_seen() -> None:
     assert "torch" in loaded_by("import pnu; import pnu.geometry.neighbor_search") & HEAVY

@@ -3,7 +3,6 @@
 import functools
 import hashlib
 import json
-import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -18,6 +17,7 @@ from pnu.data.patch_file import check_patch_file, cut_patch_file, told_open
 from pnu.extras import needed
 from pnu.io import Mesh, meshes_of, read_mesh
 from pnu.runtime.progress import counted
+from pnu.runtime.threads import processor_count
 
 with needed("training"):
     import lightning.pytorch as pl
@@ -229,8 +229,7 @@ class GeneratedDataModule(PatchDataModule):
         path = self.cache / f"{parameters['source']}_{self.patches}_{digest}.h5"
         if not path.exists():
             makers = self.makers()
-            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-            processes = min(cores, 8, 1 + len(makers) // 8)  # to start one takes as long as several shapes
+            processes = min(processor_count(), 8, 1 + len(makers) // 8)  # to start one takes as long as several shapes
             cut_patch_file(
                 path, makers, self.patches, seed=self.shape_seed, parameters=parameters, processes=processes,
                 progress=None if self.quiet else functools.partial(counted, description=f"cut patches into {path}"),

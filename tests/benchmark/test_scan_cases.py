@@ -62,6 +62,7 @@ def test_columns_are_those_of_the_kind() -> None:
     assert {row["method"] for row in rows if row["kind"] == "oneview"} == {"double", "input"}
 
 
+@pytest.mark.slow
 def test_open3ds_chain_makes_as_many_points_with_normals() -> None:
     sphere = np.random.default_rng(0).normal(size=(600, 3))
     sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)

@@ -177,6 +177,7 @@ def test_picture_refuses(
     assert re.search(message, line)
 
 
+@pytest.mark.slow
 def test_a_cloud_whose_every_point_is_repeated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_cloud(tmp_path / "c.ply", *np.hsplit(np.repeat(sphere_points(300), 20, 0), 2))
     run(reconstruct, input=tmp_path / "c.ply", output=tmp_path / "m.ply")

@@ -33,6 +33,7 @@ def meshes() -> dict[str, Mesh]:
     return {name: shapes.make(name) for name in NAMES}
 
 
+@pytest.mark.slow
 def test_truth_agrees_with_exact_closest_points(meshes: dict[str, Mesh]) -> None:
     truth, rng = MeshScene(list(meshes.values())), np.random.default_rng(0)
     order = [list(meshes)[i] for i in (2, 0, 1)]

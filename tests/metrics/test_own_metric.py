@@ -92,6 +92,7 @@ def test_a_report_of_a_metric_whose_package_is_gone(place: Path, monkeypatch: py
     assert metrics.Shown.read("other", None) == metrics.Shown("other", "other")
 
 
+@pytest.mark.slow
 def test_evaluate_and_compare_show_it(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     evaluate(["method=midpoint", *SMALL, *OWN[:2], "ratio=2", "output=found"])
     assert "reach" in capsys.readouterr().out

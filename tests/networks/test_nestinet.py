@@ -181,6 +181,7 @@ def test_arguments() -> None:
     assert tiny(experts=1).scales_of == [(0, 1)]
 
 
+@pytest.mark.slow
 def test_a_training_lowers_the_error(tmp_path: Path) -> None:
     record = Record()
     lit = UpsamplingModule(tiny(width=0.06), NormalLoss(), functools.partial(torch.optim.Adam, lr=1e-2))

@@ -557,6 +557,7 @@ def test_every_choice_trains_a_step(train: Train, choice: str) -> None:
     assert read_checkpoint(run / "checkpoints/last.ckpt")["global_step"] == 1
 
 
+@pytest.mark.slow
 def test_onecycle_without_warm_up(train: Train) -> None:
     """Two steps of which half are warm-up: torch alone divides by the length of the warm-up, 1 - 1."""
     run = train("scheduler=onecycle", "scheduler.pct_start=0.5", "trainer.max_steps=2", "trainer.max_epochs=1")
