@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pnu
@@ -58,6 +58,7 @@ def test_a_name_arrives_as_it_is(name: str) -> None:
         assert compose_config(Upsample, [argument, "output=x.ply"]).input == name
 
 
+@settings(deadline=None)
 @given(st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1))
 def test_any_name_arrives_as_it_is(name: str) -> None:
     (argument,) = shlex.split(quoted("key", name))
