@@ -55,6 +55,7 @@ def bare_imports(path: Path) -> Iterator[str]:
             yield from (name for name in names if top(name) in EXTRAS)
 
 
+@pytest.mark.slow
 def test_every_optional_import_names_its_extra(tmp_path: Path) -> None:
     found = {path.name: [*bare_imports(path)] for path in (ROOT / "pnu").rglob("*.py") if path.name not in ALONE}
     assert {name: bare for name, bare in found.items() if bare} == {}

@@ -441,6 +441,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 SMALL = ["points=256", "truth_points=500", "shapes=[heat_sink,cup]", "part=all", "kinds=[random,noise_1]"]
 
 
+@pytest.mark.slow
 def test_command_with_a_run(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main([*SMALL, "run=newest", "ratio=2", "save=true", "normals=estimate"])
     out = capsys.readouterr().out

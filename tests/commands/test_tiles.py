@@ -70,6 +70,7 @@ def test_tiles_as_jobs_give_the_same_bits(place: Path) -> None:
     assert [path.name for path in (place / NASTY).iterdir()] == ["jobs.ply"]
 
 
+@pytest.mark.slow
 def test_single_tiles_by_hand(place: Path) -> None:
     done = tiled(place, "output=dense.ply", "tiles=1")
     assert done.returncode == 2

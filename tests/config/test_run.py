@@ -249,6 +249,7 @@ def test_bad_input_is_one_line_and_exit_code_2(script: Any, arguments: list[str]
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["a (1).ply", "a=b.ply", "a,b.ply", "a b/c.ply"])
 def test_the_quotes_that_a_message_asks_for_help(script: Any, name: str) -> None:
     done = script(f'input="{name}"', "output=b")

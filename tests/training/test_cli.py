@@ -85,6 +85,7 @@ def test_help_tells_every_key_with_its_value(tmp_path: Path) -> None:
     assert "model=" in done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [

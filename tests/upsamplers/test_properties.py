@@ -101,6 +101,7 @@ def test_rigid_motion(dense: Array, normals: Array | None) -> None:
     same_surface(dense, back)
 
 
+@pytest.mark.slow
 @few
 @given(st.floats(-6, 6))
 def test_scale(exponent: float) -> None:

@@ -52,6 +52,7 @@ def make(plan: Plan, order: Sequence[int] | None = None) -> np.ndarray:
     return dense
 
 
+@pytest.mark.slow
 def test_as_many_points_as_without_tiles_and_the_same_in_any_order(tmp_path: Path) -> None:
     points = sheet(601)
     points[7] = points[3]

@@ -94,6 +94,7 @@ def test_poisson_surface() -> None:
     assert float(metrics.spacing_cv(dense)) < 0.15
 
 
+@pytest.mark.slow
 def test_poisson_makes_no_bubble_at_an_open_border() -> None:
     pytest.importorskip("open3d")
     normals = sphere(4000)
