@@ -32,7 +32,7 @@ check: $(STAMP)   ## lint, format and types
 test: $(STAMP)   ## the test suite (minutes); the slow ones: nightly
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto $(ARGS)
 
-nightly: $(STAMP)   ## the slow tests from start to end and a summary: kill -9, several processes, fuzzing, documented commands (an hour)
+nightly: $(STAMP)   ## the slow tests from start to end and a summary: kill -9, several processes, fuzzing, documented commands (an hour or two)
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.nightly $(ARGS)
 
 coverage: $(STAMP)   ## the test suite, and which lines of pnu/ it does not reach

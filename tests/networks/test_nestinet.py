@@ -1,6 +1,5 @@
 """Nesti-Net: Fisher vectors by hand, the layer table of its paper, its loss by hand, what it does not see."""
 
-import functools
 import math
 from pathlib import Path
 
@@ -8,16 +7,13 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
-from torch.utils.data import DataLoader
 
 from pnu.benchmark import normal_task
 from pnu.losses import NormalLoss
 from pnu.networks.fisher_vectors import fisher_vectors, grid_centers, normalized_vectors
 from pnu.networks.nestinet import Halving, NestiNet, local_means
-from pnu.training.lightning_module import UpsamplingModule
-from tests.networks.test_pcpnet import neighborhoods, patches
+from tests.networks.test_pcpnet import lowers_the_error, neighborhoods
 from tests.reconstruction.test_surfaces import icosphere
-from tests.training.test_lit import Record, trainer
 
 
 def tiny(**options: object) -> NestiNet:
@@ -183,14 +179,7 @@ def test_arguments() -> None:
 
 @pytest.mark.slow
 def test_a_training_lowers_the_error(tmp_path: Path) -> None:
-    record = Record()
-    lit = UpsamplingModule(tiny(width=0.06), NormalLoss(), functools.partial(torch.optim.Adam, lr=1e-2))
-    items = [patches()[0, i] for i in range(4)]
-    load = functools.partial(DataLoader, items, batch_size=2)
-    trainer(tmp_path, record, max_steps=20, max_epochs=-1).fit(lit, load(), load())
-    values = record.values("train/loss")
-    assert values[-1] < 0.8 * values[0]
-    assert record.values("val/normal_unsigned_deg")
+    lowers_the_error(tiny(width=0.06), tmp_path)
 
 
 def test_as_a_row_of_the_task() -> None:
