@@ -10,6 +10,7 @@ from pnu.geometry.flipped_parts import flipped_share
 from pnu.geometry.normal_estimation import complete_normals, orient_normals
 from pnu.geometry.normal_sides import repaired_signs, seen_signs
 from pnu.geometry.orientation import NeighborCloud, is_closed
+from pnu.geometry.single_view import seen_from_one_side
 from pnu.geometry.unit_sphere import unit_sphere_frame
 from pnu.io.sensor import Sight
 from pnu.runtime.progress import Progress, silent
@@ -18,6 +19,7 @@ Choice = Literal["auto", "estimate", "orient", "keep"]
 Refine = Callable[[np.ndarray, np.ndarray, Progress], np.ndarray]
 """points (n, 3) in the unit sphere, rough normals (n, 3) whose sides agree -> better ones (n, 3)."""
 OUTWARD = "outward, by the winding field"
+ONE_SIDE = "to where all of it was seen from, one side"
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -123,9 +125,13 @@ def _signs(
         sign, by = repaired_signs(unit, lines)
         return sign, OUTWARD if by == "outward" else "that of most given"
     oriented = orient_normals(unit, lines) if known.any() else lines
+    facing = seen_from_one_side(unit, oriented)
+    oriented = oriented if facing is None else facing
     sign = np.where((oriented * lines).sum(1) < 0, -1.0, 1.0)
     if sight is not None:
         return (-sign if sight.inward else sign), sight.words
+    if facing is not None:
+        return sign, ONE_SIDE
     closed = is_closed(NeighborCloud.of(unit), oriented.astype(np.float32))
     return sign, OUTWARD if closed else "one and the same over an open surface"
 

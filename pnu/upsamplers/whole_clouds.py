@@ -20,6 +20,7 @@ from pnu.geometry.attributes import carry
 from pnu.geometry.cloud_normals import check_not_a_line, settled_normals
 from pnu.geometry.normal_estimation import complete_normals
 from pnu.geometry.point_tree import PointTree
+from pnu.geometry.single_view import seen_from_one_side
 from pnu.geometry.unit_sphere import Frame, unit_sphere_frame
 from pnu.io import Cloud, check_cloud
 from pnu.io.library_clouds import Kind, LibraryCloud, kind_of, tensor_like
@@ -487,6 +488,9 @@ def _prepare(cloud: Cloud, progress: Progress, *, refine: bool = False) -> tuple
     if missing.any():
         progress("normals", 0, 1)
         directions = complete_normals(unit, given)
+        if given is None:
+            facing = seen_from_one_side(unit, directions)
+            directions = directions if facing is None else facing
         if refine:
             directions = np.where(missing[:, None], learned_normals(unit, directions, progress), directions)
         progress("normals", 1, 1)

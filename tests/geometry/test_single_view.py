@@ -1,0 +1,80 @@
+"""A cloud seen from one side is known by that nothing lies behind anything, and its normals look there."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+import pnu
+from pnu.geometry.cloud_normals import ONE_SIDE, settled_normals
+from pnu.geometry.single_view import seen_from_one_side, single_view
+
+Array = NDArray[np.float64]
+BALLS = np.array(
+    [[0, 0, 0, 0.5], [0.45, 0.1, 0.8, 0.25], [-0.3, 0.4, 0.6, 0.3], [-0.1, -0.5, -0.7, 0.6], [0.6, -0.5, 0.4, 0.2]]
+)
+
+
+def view_of_balls(across: int = 70) -> tuple[Array, Array]:
+    """Points and outward normals of five balls as a camera far up the z axis sees them, one a pixel."""
+    x, y = (grid.ravel() for grid in np.meshgrid(*[np.linspace(-1.2, 1.2, across)] * 2))
+    rise = BALLS[:, 3, None] ** 2 - (x - BALLS[:, :1]) ** 2 - (y - BALLS[:, 1:2]) ** 2
+    top = np.where(rise > 0, BALLS[:, 2:3] + np.sqrt(np.maximum(rise, 0)), -np.inf)
+    ball = top.argmax(0)
+    points = np.stack([x, y, top.max(0)], 1)
+    normals = (points - BALLS[ball, :3]) / BALLS[ball, 3:]
+    seen = np.isfinite(points[:, 2]) & (normals[:, 2] > 0.1)
+    return points[seen], normals[seen]
+
+
+def around_balls(n: int) -> Array:
+    """Points all around the same balls."""
+    rng = np.random.default_rng(0)
+    unit = rng.normal(size=(len(BALLS), n, 3))
+    return np.concatenate(BALLS[:, None, :3] + BALLS[:, None, 3:] * unit / np.linalg.norm(unit, axis=2, keepdims=True))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_direction_is_found_wherever_the_cloud_lies(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    turn = Rotation.random(rng=rng).as_matrix()
+    points = view_of_balls()[0]
+    moved = 40 * points[rng.permutation(len(points))] @ turn.T + rng.normal(size=3)
+    found = single_view(moved)
+    assert found is not None
+    assert abs(found @ turn[:, 2]) > np.cos(np.radians(15))
+
+
+def test_there_is_none_where_the_back_is_seen_too_or_points_are_few() -> None:
+    assert single_view(around_balls(600)) is None
+    points = view_of_balls()[0]
+    assert single_view(np.vstack([points, around_balls(150)])) is None
+    assert single_view(points[:: len(points) // 150]) is None
+    assert seen_from_one_side(around_balls(600), np.ones((3000, 3))) is None
+
+
+def test_all_pieces_look_to_the_camera() -> None:
+    points, true = view_of_balls()
+    sign = np.where(points[:, 0] > 0.25, -1.0, 1.0)
+    found = seen_from_one_side(points, true * sign[:, None])
+    assert found is not None
+    assert ((found * true).sum(1) < 0).mean() < 1e-3
+    turn = Rotation.from_euler("xyz", [0.4, 1.1, 2.0]).as_matrix()
+    settled = settled_normals(points @ turn.T, None)
+    assert ((settled.normals @ turn * true).sum(1) < 0).mean() < 0.005
+    assert settled.words == f"{len(points)} estimated; side: {ONE_SIDE}"
+    dense = pnu.upsample(points @ turn.T, ratio=2)
+    assert ((dense[:, 3:] @ turn)[:, 2] > 0).mean() > 0.98
+
+
+def test_dishes_and_cups_of_one_view_look_to_one_side() -> None:
+    x, y = (grid.ravel() for grid in np.meshgrid(*[np.linspace(-1.1, 1.1, 60)] * 2))
+    height = np.full_like(x, np.nan)
+    for number, (center_x, center_y) in enumerate(((0.5, 0.5), (-0.5, 0.5), (0.5, -0.5), (-0.5, -0.5))):
+        aside = np.hypot(x - center_x, y - center_y)
+        bulge = (-1.0) ** (number + 1) * np.sqrt(np.maximum(0.2 - aside**2, 0))
+        height = np.where(aside < 0.4, bulge + 0.7 * number, height)
+    points = np.stack([x, y, height], 1)[np.isfinite(height)]
+    turn = Rotation.from_euler("xyz", [0.4, 1.1, 2.0]).as_matrix()
+    up = (settled_normals(points @ turn.T, None).normals @ turn)[:, 2] > 0
+    assert up.mean() < 0.01 or up.mean() > 0.99
