@@ -1,10 +1,10 @@
 """How good upsampled clouds are: `python -m bench.quality [FOLDER] [--settings given noise_1 ...] [--methods ...]`.
 
 FOLDER holds pairs, clouds/NAME.xyz with normals and truth/NAME.ply with truth/NAME_<count>.npy; without it the test
-part of the procedural shapes is drawn. Each setting changes these inputs in one way; all methods get the same ones with
-the same estimated normals where a setting gives none. --surfaces measures Poisson surfaces of the input, of its dense
-versions and of the truth's own samples. Every setting is kept in OUTPUT/quality_<setting>.json, and OUTPUT/quality.md
-has the tables of all.
+part of the procedural shapes is drawn. Each setting changes these inputs in one way; all methods get the same points,
+and where a setting gives no normals the same estimated ones, but for "surface", which finds its own. --surfaces
+measures Poisson surfaces of the input, of its dense versions and of the truth's own samples. Every setting is kept in
+OUTPUT/quality_<setting>.json, and OUTPUT/quality.md has the tables of all.
 """
 
 import argparse
@@ -80,19 +80,25 @@ def inputs(cases: Iterator[Case], setting: Setting, seed: int) -> Iterator[Case]
         yield Case(setting.title, points, normals, case.truth)
 
 
-def network(method: str, setting: Setting) -> nn.Module | Upsampler:
-    """A classical method, or weights or a run; "surface" takes the weights for the normals of the setting."""
+def network(method: str) -> nn.Module | Upsampler | str:
+    """A classical method, or weights or a run; "surface" by its name, which means the weights that fit a cloud."""
     if method in CLASSICAL:
         return classical(method)
-    return checkpoints.load("surface_estimated" if method == "surface" and not setting.given else method)
+    return method if method == "surface" else checkpoints.load(method)
+
+
+def normals_for(method: str, case: Case, setting: Setting) -> np.ndarray | None:
+    """Those that a method gets: "surface" finds missing ones by itself, as for users."""
+    return case.normals if setting.given or method != "surface" else None
 
 
 def clouds(cases: list[Case], setting: Setting, methods: list[str], seed: int, folder: Path) -> Iterator[Row]:
     """Metrics of each method on each case; its cloud is written to folder/<method>/<shape>.ply."""
     for method in methods:
-        model = network(method, setting)
+        model = network(method)
         for case in cases:
-            dense = upsample(case.points, case.normals, ratio=setting.ratio, model=model, seed=seed)
+            normals = normals_for(method, case, setting)
+            dense = upsample(case.points, normals, ratio=setting.ratio, model=model, seed=seed)
             (folder / Path(method).name).mkdir(parents=True, exist_ok=True)
             write_cloud(folder / Path(method).name / f"{case.truth.shape}.ply", dense[:, :3], dense[:, 3:])
             values = metrics.compare(dense, case.truth.samples)
@@ -113,7 +119,11 @@ def poisson(cases: list[Case], setting: Setting, methods: list[str], seed: int, 
         for method in methods:
             if method != "poisson":
                 found[Path(method).name] = upsample(
-                    case.points, case.normals, ratio=setting.ratio, model=network(method, setting), seed=seed
+                    case.points,
+                    normals_for(method, case, setting),
+                    ratio=setting.ratio,
+                    model=network(method),
+                    seed=seed,
                 )
         for method, cloud in found.items():
             mesh = reconstruction.reconstruct(cloud[:, :3], cloud[:, 3:], name=case.truth.shape).mesh

@@ -15,9 +15,11 @@ from pnu.io.cloud import chosen
 
 Treatment = Literal["auto", "keep"]
 TREATMENTS = ("auto", "keep")
-NOISY = 0.45  # spacings of noise that hides what a scan is
+Character = Literal["clean", "scanned", "noisy"]
+"""What a cloud is like: clean and scanned ones show little noise, scanned ones lie in lines or have many strays."""
+NOISY = 0.22  # spacings of noise from which on a cloud is noisy; then what looks stray says nothing of scans
 
-__all__ = ["TREATMENTS", "Cleaned", "Treatment", "clean_cloud", "stray_points"]
+__all__ = ["TREATMENTS", "Character", "Cleaned", "Treatment", "character_of", "clean_cloud", "stray_points"]
 
 
 class Cleaned(NamedTuple):
@@ -25,7 +27,7 @@ class Cleaned(NamedTuple):
 
     cloud: Cloud  # its notes say what was done
     stray: NDArray[np.int64]  # rows of the cloud before that were taken out as stray
-    scanned: bool = False  # it lies as scans do: in lines, thinned out now, or with many strays and no great noise
+    character: Character = "clean"  # of a cloud without normals; what has them is "clean"
 
 
 def clean_cloud(
@@ -66,10 +68,17 @@ def clean_cloud(
         settled = settled_normals(cloud.points, cloud.normals)
         notes.append(f"normals: {settled.words} (normals=keep)")
         cloud = cloud._replace(normals=settled.normals)
-    scanned = rows is not None or (len(stray) > MANY * (len(stray) + len(cloud.points)) and is_quiet(cloud.points))
-    return Cleaned(cloud._replace(notes=tuple(notes)), stray, scanned)
+    character: Character = "clean"
+    if rows is not None:
+        character = "scanned"
+    elif cloud.normals is None:
+        character = character_of(cloud.points, len(stray) / (len(stray) + len(cloud.points)))
+    return Cleaned(cloud._replace(notes=tuple(notes)), stray, character)
 
 
-def is_quiet(points: NDArray[np.float64]) -> bool:
-    """Whether the noise of points (n, 3) is less than 0.45 of their spacing: more of it looks like strays too."""
-    return noise_level(points) < NOISY * spacing(points)
+def character_of(points: NDArray[np.float64], stray: float = 0.0) -> Character:
+    """Of points (n, 3) without normals, from which a share was taken as stray."""
+    noise = noise_level(points) / spacing(points)
+    if noise > NOISY:
+        return "noisy"
+    return "scanned" if stray > MANY else "clean"

@@ -59,11 +59,11 @@ def cleaned(cfg: Any, cloud: "Cloud", **treatments: Any) -> tuple["Cleaned", "ND
     Where keys or file say more of the side of normals than the shape of the cloud does, each point has a normal.
     """
     from pnu.cleaning import clean_cloud
-    from pnu.geometry.cloud_normals import is_height_map
+    from pnu.geometry.cloud_normals import sight_by_places
     from pnu.io.sensor import asked_sight, sight_of
 
     told = asked_sight(cfg.viewpoint, cfg.up, cfg.side) is not None or cfg.normals == "orient"
-    told = told or sight_of(cfg.input, cloud.attributes) is not None or is_height_map(cloud.points)
+    told = told or sight_of(cfg.input, cloud.attributes) is not None or sight_by_places(cloud.points) is not None
     found = clean_cloud(cloud, **treatments, signs="keep" if told or cfg.normals == "keep" else "auto")
     own = found.cloud.normals
     return (found._replace(cloud=sided(cfg, found.cloud, learned=False)[0]) if told else found), own

@@ -42,7 +42,7 @@ class Compare:
     ratio: float = doc("points out for each point in")
     passes: bool = doc("also networks that were trained for another ratio: by passes and farthest points")
     keep: str = doc(KEEP)
-    normals: str = doc("of the inputs: given, those of the shape; estimate, for which surface_estimated is made")
+    normals: str = doc("of the inputs: given, those of the shape; estimate: none, which surface has weights for")
     metrics: list[str] = doc("classes of metrics of your own, measured beside pnu's: [mylab.Roughness]")
     allow: list[str] = doc("packages of your own whose classes may be named, such as [mylab]")
     output: str | None = doc("folder for index.html, metrics.json, metrics.csv, figures/; null: in outputs/comparison/")

@@ -15,7 +15,7 @@ from pnu.runtime.progress import steps
 from pnu.runtime.provenance import provenance
 
 NORMALS = {"given": "as given", "estimate": "estimated"}
-DEFAULT = {"given": "surface", "estimate": "surface_estimated"}  # without run= and method=
+DEFAULT = "surface"  # without run= and method=
 SETTINGS = ("ratio", "points", "truth_points", "keep", "normals", "search", "passes", "seed")
 
 
@@ -47,7 +47,7 @@ class Evaluate:
     ratio: float = doc("points out for each point in")
     passes: bool = doc("also where the network was trained for another ratio: by passes and farthest points")
     keep: str = doc(KEEP)
-    normals: str = doc("of the inputs: given, those of the shape; estimate, for which run=surface_estimated is made")
+    normals: str = doc("of the inputs: given, those of the shape; estimate: none, which run=surface has weights for")
     search: str = doc("for closest surface points. exact; open3d: as other scripts (differs in the faces at edges)")
     metrics: list[str] = doc("classes of metrics of your own, measured beside pnu's: [mylab.Roughness]")
     allow: list[str] = doc("packages of your own whose classes may be named, such as [mylab]")
@@ -76,7 +76,7 @@ def evaluate(cfg: Any) -> None:
     protocol, source = protocol_source(cfg)
     find = functools.partial(find_metric, allow=cfg.allow)
     chosen = protocol.metrics(metrics.with_own(cfg.metrics, find, benchmark.of_kinds(source.kinds)))
-    subject = cfg.method or str(checkpoints.resolve(cfg.run or DEFAULT[cfg.normals]))
+    subject = cfg.method or str(checkpoints.resolve(cfg.run or DEFAULT))
     if cfg.method not in (None, "open3d", *CLASSICAL):
         raise ValueError(f"method={cfg.method}: expected one of {', '.join(CLASSICAL)} or open3d")
     if cfg.method == "open3d":
@@ -89,6 +89,7 @@ def evaluate(cfg: Any) -> None:
         )  # fmt: skip
     is_run = not cfg.method and Path(subject).is_dir()
     name = run_name(subject) if is_run else Path(subject).stem
+    name += "_estimated" if cfg.normals == "estimate" and not is_run else ""
     default = Path(subject, "evaluation") if is_run else Path("outputs", "evaluation", name)
     within = subject if is_run and not cfg.output else None
     output = benchmark.result_folder(cfg.output or default / source.name, within)

@@ -68,14 +68,14 @@ def scan(cfg: Any) -> None:
 
     wanted = cfg.ratio if cfg.spacing is None else whole_clouds.ratio_of_spacing(before.points, cfg.spacing)
     count = whole_clouds.output_count(len(before.points), wanted)
-    (cloud, stray, scanned), own = _sides.cleaned(cfg, before)
+    (cloud, stray, character), own = _sides.cleaned(cfg, before)
     look = describe_cloud(cloud.points, cloud.normals)
     for text in (*cloud.notes, str(look), *look.warnings()):
         say(f"        {text}")
     if cfg.removed is not None:
         gone = {name: values[stray] for name, values in before.attributes.items()}
         io.write_cloud(cfg.removed, before.points[stray], None, gone)
-    network = LoadedWeights("surface").network(own, scanned)
+    network = LoadedWeights("surface").network(own, character)
     for name, value in QUALITIES[cfg.quality].items():
         setattr(network, name, value)
     device = "cpu" if is_cpu("auto") else "cuda"

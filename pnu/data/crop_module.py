@@ -22,7 +22,8 @@ class ProjectionDataModule(EpochDataModule):
         scans: share of the clouds that are simulated scans
         blue: share of the other clouds whose points keep a distance, as blue noise
         least: points of the smallest clouds
-        noise: largest standard deviation, in radii, of the noise of clouds whose normals are estimated; half have none
+        noise: largest standard deviation, in radii, of the noise of clouds whose normals are estimated
+        noisy: share of these clouds that has noise
         clouds: of an epoch, each drawn anew
         size: points of a crop
         views: crops of a cloud
@@ -39,7 +40,7 @@ class ProjectionDataModule(EpochDataModule):
         self, root: str | None = None, procedural: bool = True, validation: Iterable[str] = (),
         normals: Literal["given", "estimated", "mixed"] = "given",
         scans: float = 0.0, blue: float = 0.15, least: int = LEAST,
-        noise: float = 0.02, clouds: int = 6400, size: int = 384, views: int = 2,
+        noise: float = 0.02, noisy: float = 0.5, clouds: int = 6400, size: int = 384, views: int = 2,
         batch_size: int = 8, points: int = 2048, workers: int = 0, seed: int = 0,
     ) -> None:  # fmt: skip
         super().__init__(batch_size, workers, seed)
@@ -47,7 +48,7 @@ class ProjectionDataModule(EpochDataModule):
             raise ValueError(f"data.points={points}: expected at least {SMALLEST}")
         self.evaluation_batch_size = 1
         self.root, self.procedural, self.held_out = root, procedural, list(validation)
-        self.scans, self.blue, self.least, self.noise = scans, blue, least, noise
+        self.scans, self.blue, self.least, self.noise, self.noisy = scans, blue, least, noise, noisy
         self.normals, self.clouds, self.size, self.views, self.points = normals, clouds, size, views, points
         self.truth: MeshScene | None = None
 
@@ -83,6 +84,7 @@ class ProjectionDataModule(EpochDataModule):
             blue=self.blue,
             least=self.least,
             noise=self.noise,
+            noisy=self.noisy,
             seed=self.seed,
         )
         clouds = {

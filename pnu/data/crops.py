@@ -29,7 +29,7 @@ class Crops(Dataset[dict[str, Any]]):
 
     A cloud has `least` to 8000 points, drawn at random, unevenly (20 %), or as blue noise (a share `blue`). With
     normals="given" they are true, in 15 % of the clouds a little off, and 20 % of the clouds have up to 1 % noise; with
-    "estimated" they come from the cloud, with the true side, and half of the clouds have noise up to `noise`
+    "estimated" they come from the cloud, with the true side, and a share `noisy` of the clouds has noise up to `noise`
     (Gaussian, standard deviation in units of the shape's radius); "mixed": estimated in 70 % of the crops. Inside and
     outside are swapped in 30 %. A share `scans` of the clouds are simulated scans (`pnu.data.scanner`), most strays
     removed and lines thinned out, as `pnu.upsample` does before the network sees them.
@@ -41,7 +41,8 @@ class Crops(Dataset[dict[str, Any]]):
 
     def __init__(
         self, meshes: dict[str, Mesh], length: int, *, size: int = 384, views: int = 2, normals: str = "given",
-        scans: float = 0.0, blue: float = 0.15, least: int = LEAST, noise: float = 0.02, seed: int = 0,
+        scans: float = 0.0, blue: float = 0.15, least: int = LEAST, noise: float = 0.02, noisy: float = 0.5,
+        seed: int = 0,
     ) -> None:  # fmt: skip
         if normals not in ("given", "estimated", "mixed"):
             raise ValueError(f"data.normals={normals}: expected given, estimated or mixed")
@@ -51,6 +52,8 @@ class Crops(Dataset[dict[str, Any]]):
             raise ValueError(f"data.blue={blue}: expected a share from 0 to {1 - UNEVEN}; {UNEVEN} are uneven")
         if not 0 <= noise <= 0.1:
             raise ValueError(f"data.noise={noise}: expected a standard deviation from 0 to 0.1 radii")
+        if not 0 <= noisy <= 1:
+            raise ValueError(f"data.noisy={noisy}: expected a share from 0 to 1")
         if not SMALLEST <= least <= USUAL[0]:
             raise ValueError(f"data.least={least}: expected {SMALLEST} to {USUAL[0]} points")
         if not SMALLEST <= size <= least:
@@ -61,7 +64,7 @@ class Crops(Dataset[dict[str, Any]]):
             raise ValueError(f"data: expected clouds >= 1 and views >= 1, found {length} and {views}")
         self.names, self.meshes = list(meshes), list(meshes.values())
         self.length, self.size, self.views, self.blue, self.least = length, size, views, blue, least
-        self.noise = noise
+        self.noise, self.noisy = noise, noisy
         self.estimated, self.mixed, self.scans, self.seed = normals != "given", normals == "mixed", scans, seed
         self.scanners = [Scanner(mesh) for mesh in self.meshes]
 
@@ -132,7 +135,7 @@ class Crops(Dataset[dict[str, Any]]):
         else:
             clean = uneven(sample_area(mesh, 4 * n, rng), n, rng)
         noisy = clean.copy()
-        if rng.random() < (0.5 if self.estimated else 0.2):
+        if rng.random() < (self.noisy if self.estimated else 0.2):
             sigma = rng.uniform(0, rng.choice([0.3, 1]) * self.noise if self.estimated else 0.01)
             noisy[:, :3] += sigma * rng.standard_normal((n, 3))
         if not self.estimated and rng.random() < 0.15:

@@ -10,7 +10,7 @@ from pnu.geometry.flipped_parts import flipped_share
 from pnu.geometry.normal_estimation import complete_normals, orient_normals
 from pnu.geometry.normal_sides import repaired_signs, seen_signs
 from pnu.geometry.orientation import NeighborCloud, is_closed
-from pnu.geometry.single_view import seen_from_one_side
+from pnu.geometry.single_view import is_camera, seen_from_one_side
 from pnu.geometry.unit_sphere import unit_sphere_frame
 from pnu.io.sensor import Sight
 from pnu.runtime.progress import Progress, silent
@@ -19,7 +19,7 @@ Choice = Literal["auto", "estimate", "orient", "keep"]
 Refine = Callable[[np.ndarray, np.ndarray, Progress], np.ndarray]
 """points (n, 3) in the unit sphere, rough normals (n, 3) whose sides agree -> better ones (n, 3)."""
 OUTWARD = "outward, by the winding field"
-ONE_SIDE = "to where all of it was seen from, one side"
+ONE_SIDE, FROM_ABOVE = "to where all of it was seen from, one side", "up, as land that was seen from above"
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -49,7 +49,8 @@ def settled_normals(
         choice: "auto": axes of those given, their signs where they agree; "orient": their axes, all signs chosen;
             "keep": as they are; "estimate": none of those given. What is missing is estimated.
         asked: what shall decide the side of all that are not kept.
-        found: what the file says; it decides where nothing is asked and given signs don't agree, or there are none.
+        found: what the file says; it decides where nothing is asked and given signs don't agree, or there are none;
+            where it says nothing, `sight_by_places`.
         neighbors: of the plane fits that estimates begin with.
         refine: what makes better ones of those that are estimated.
         progress: called as progress(stage, done, total).
@@ -71,7 +72,7 @@ def settled_normals(
     lines = complete_normals(unit, given, neighbors)
     if refine is not None and not known.all():
         lines = np.where(known[:, None], lines, refine(unit, lines, progress))
-    sight = asked or found or (Sight("up, as a map of heights", up=UP) if is_height_map(points) else None)
+    sight = asked or found or sight_by_places(points)
     if sight is not None and sight.viewpoint is not None:
         center, scale = frame.center[0], frame.scale.item()
         places = sight.viewpoint[order] if sight.viewpoint.ndim == 2 else sight.viewpoint
@@ -103,6 +104,15 @@ def contradiction(points: np.ndarray, normals: np.ndarray) -> str:
     return f"{share:.0%} of neighbors contradicted each other" if share > CONTRADICTING else ""
 
 
+def sight_by_places(points: np.ndarray) -> Sight | None:
+    """From where points (n, 3) were seen, as these say: as a map of heights, or by a camera at the origin."""
+    if is_height_map(points):
+        return Sight("up, as a map of heights", up=UP)
+    if is_camera(np.zeros(3), points):
+        return Sight("towards a camera at the origin, whose pixels they are", viewpoint=np.zeros(3))
+    return None
+
+
 def is_height_map(points: np.ndarray) -> bool:
     """Whether points (n, 3) are heights z, one for each place of a grid in x and y, a third of which they fill."""
     x, y = np.unique(points[:, 0]), np.unique(points[:, 1])
@@ -126,12 +136,12 @@ def _signs(
         return sign, OUTWARD if by == "outward" else "that of most given"
     oriented = orient_normals(unit, lines) if known.any() else lines
     facing = seen_from_one_side(unit, oriented)
-    oriented = oriented if facing is None else facing
+    oriented = oriented if facing is None else facing.normals
     sign = np.where((oriented * lines).sum(1) < 0, -1.0, 1.0)
     if sight is not None:
         return (-sign if sight.inward else sign), sight.words
     if facing is not None:
-        return sign, ONE_SIDE
+        return sign, FROM_ABOVE if facing.above else ONE_SIDE
     closed = is_closed(NeighborCloud.of(unit), oriented.astype(np.float32))
     return sign, OUTWARD if closed else "one and the same over an open surface"
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pnu.cleaning import Character
 from pnu.networks import checkpoints
 from pnu.networks.compiled_surface import CompiledSurface, read_compiled
 from pnu.runtime.threads import torch_if_loaded
@@ -22,18 +23,18 @@ if TYPE_CHECKING:
     import torch
     from torch import nn
 
+WITHOUT_NORMALS: dict[Character, str] = {
+    "clean": "surface_estimated", "scanned": "surface_scans", "noisy": "surface_noisy",
+}  # fmt: skip
 DRIVERS = ("/dev/nvidiactl", "/dev/dxg", "/dev/kfd")  # where one of them is, torch may find a GPU
 
 
 def weights_source(
-    model: str | PathLike[str], normals: np.ndarray | None, scanned: bool = False
+    model: str | PathLike[str], normals: np.ndarray | None, character: Character = "clean"
 ) -> str | PathLike[str]:
-    """What `checkpoints.load` takes, for a cloud with these normals: "surface" means one of three, "newest" a run.
-
-    scanned: it lies as scans do, see `pnu.cleaning.Cleaned`.
-    """
+    """What `checkpoints.load` takes, for a cloud with these normals: "surface" means one of four, "newest" a run."""
     if model == "surface" and normals is None:
-        return "surface_scans" if scanned else "surface_estimated"
+        return WITHOUT_NORMALS[character]
     return checkpoints.resolve(model)
 
 
@@ -51,12 +52,12 @@ class LoadedWeights:
         self.source = checkpoints.resolve(source)
         self.read: dict[tuple[str, bool], Any] = {}
 
-    def network(self, normals: np.ndarray | None = None, scanned: bool = False, device: str = "auto") -> Any:
+    def network(self, normals: np.ndarray | None = None, character: Character = "clean", device: str = "auto") -> Any:
         """That for a cloud with these normals, see `weights_source`.
 
         On the CPU it is one of compiled kernels, for which torch is not imported, where they know it.
         """
-        meant, on_cpu = str(weights_source(self.source, normals, scanned)), is_cpu(device)
+        meant, on_cpu = str(weights_source(self.source, normals, character)), is_cpu(device)
         if (meant, on_cpu) not in self.read:
             self.read[meant, on_cpu] = (
                 classical(meant)

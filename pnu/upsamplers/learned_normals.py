@@ -3,12 +3,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from pnu.cleaning import character_of
 from pnu.runtime.progress import Progress, silent
 from pnu.upsamplers.context import Context
 from pnu.upsamplers.inference import LoadedWeights, inferring
-from pnu.upsamplers.surface_projection import SurfaceProjection
+from pnu.upsamplers.surface_projection import SMOOTH, SurfaceProjection, noise_in_spacings
 
-WEIGHTS = "surface_estimated"
 PASSES = 2  # a third changes little
 Floats = NDArray[np.float64]
 
@@ -17,10 +17,14 @@ def learned_normals(points: Floats, normals: Floats, progress: Progress = silent
     """Unit normals at points (n, 3) of a cloud in the unit sphere, from rough ones (n, 3) whose sides agree: (n, 3).
 
     As `pnu upsample` has them where a cloud comes without: the shipped network sees each point's neighbors with their
-    rough normals, then with its own.
+    rough normals, then with its own; in a noisy cloud also once its points lie on the surface.
     """
-    network = LoadedWeights(WEIGHTS).network(device="cpu")
+    network = LoadedWeights("surface").network(character=character_of(points), device="cpu")
     with inferring(network):
-        upsampler, cloud = SurfaceProjection(network), np.hstack([points, normals])
-        found = upsampler.with_refined_normals(cloud, PASSES, Context(progress=progress))[:, 3:]
+        upsampler, context = SurfaceProjection(network), Context(progress=progress)
+        cloud = np.hstack([points, normals])
+        cloud = upsampler.with_refined_normals(cloud, PASSES, context)
+        if noise_in_spacings(cloud) > SMOOTH:
+            cloud = upsampler.smoothed(cloud, context)
+        found = cloud[:, 3:]
     return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-12))

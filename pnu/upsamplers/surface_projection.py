@@ -80,8 +80,7 @@ class SurfaceProjection:
             compile_in_background()
         cloud = self.with_refined_normals(cloud, self.network.passes, context)
         if noise_in_spacings(cloud) > SMOOTH:
-            smooth, _ = self.projected(cloud, cloud, context, "smoothing, the points are noisy")
-            measured, cloud = cloud, smooth
+            measured, cloud = cloud, self.smoothed(cloud, context)
         else:
             measured = cloud
         places = cloud[:, :3]
@@ -151,6 +150,13 @@ class SurfaceProjection:
         return in_parts(
             project, query, cloud, workers=context.workers or InProcess(self.network), context=context, stage=stage
         )
+
+    def smoothed(self, cloud: Floats, context: Context) -> Floats:
+        """A noisy cloud (n, 6) with its points projected, and normals found anew there if the network finds them."""
+        smooth, _ = self.projected(cloud, cloud, context, "smoothing, the points are noisy")
+        if not self.network.passes:
+            return smooth
+        return self.with_normals(smooth, smooth, context, "normals of the smooth points")
 
     def with_refined_normals(self, cloud: Floats, passes: int, context: Context) -> Floats:
         """A cloud (n, 6) with the normals that the network finds at its points, so many times one after the other."""

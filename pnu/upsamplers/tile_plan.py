@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnu import __version__
-from pnu.cleaning import is_quiet, stray_points
+from pnu.cleaning import Character, character_of, stray_points
 from pnu.cleaning.outliers import MANY
 from pnu.geometry.anisotropy import thinned_lines
 from pnu.geometry.cells import Cells
@@ -86,7 +86,7 @@ class Facts:
     smooth: bool = False
     """Whether points are noisy beside their spacing, and smoothed first."""
     keep: bool = False
-    scanned: bool = False
+    character: Character = "clean"
     turned: str = ""
     """Why the sides of given normals are chosen anew; empty: they are not."""
     heights: bool = False
@@ -375,7 +375,10 @@ def _decided(folder: Path, keys: Keys, facts: Facts, progress: Progress) -> None
     facts.smooth = most("noisy")
     facts.heights = most("heights")
     stray = float(weight @ np.array([look["stray"] for look in found])) / weight.sum()
-    facts.scanned = facts.lined is not None or (stray > MANY and most("quiet"))
+    if facts.lined is not None:
+        facts.character = "scanned"
+    elif not facts.given:
+        facts.character = "noisy" if most("loud") else "scanned" if stray > MANY else "clean"
     facts.keep = keys.keep if isinstance(keys.keep, bool) else most("even")
     if facts.given and keys.normals == "auto" and most("turned"):
         facts.turned = next(look["turned"] for look in found if look["turned"])
@@ -397,7 +400,7 @@ def _look(points: np.ndarray, normals: np.ndarray | None, keys: Keys, size: int)
     look: dict[str, Any] = {"points": size, "stray": float(stray.mean()), "heights": is_height_map(points)}
     points, normals = points[~stray], None if normals is None else normals[~stray]
     look["apart_raw"] = float(np.quantile(local_spacing(points), 0.9))
-    look["quiet"] = is_quiet(points)
+    look["loud"] = character_of(points) == "noisy"
     look["turned"] = "" if normals is None else contradiction(points, normals)
     thinned = thinned_lines(points) if normals is None else None
     look["lined"] = None

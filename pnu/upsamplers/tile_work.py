@@ -50,7 +50,7 @@ Known = Callable[[NDArray[np.float64]], NDArray[np.bool_]]
 def run_of(plan: Plan) -> str:
     """The weights for all tiles of a plan."""
     none_given = None if not plan.facts.given else np.empty((0, 3))
-    return str(weights_source(plan.keys.run, none_given, plan.facts.scanned))
+    return str(weights_source(plan.keys.run, none_given, plan.facts.character))
 
 
 def loaded(run: str, device: str = "auto") -> Any:
@@ -281,7 +281,7 @@ def made(plan: Plan, number: int, whole: Whole, upsampler: SurfaceProjection, pr
     context = context_of(upsampler, progress=progress, keep=facts.keep)
     measured = smooth = upsampler.with_refined_normals(cloud, upsampler.network.passes, context)
     if facts.smooth and not facts.keep:
-        smooth, _ = upsampler.projected(measured, measured, context, "smoothing, the points are noisy")
+        smooth = upsampler.smoothed(measured, context)
     found: list[NDArray[np.float64]] = []
     kept = 0
     for group, count in _groups(rows["point"], cloud, frame, whole, partial(_known, plan, number, frame)):

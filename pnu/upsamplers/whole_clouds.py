@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, overload
 import numpy as np
 
 from pnu import __version__
-from pnu.cleaning import Treatment, clean_cloud
+from pnu.cleaning import Character, Treatment, clean_cloud
 from pnu.geometry.attributes import carry
 from pnu.geometry.cloud_normals import check_not_a_line, settled_normals
 from pnu.geometry.normal_estimation import complete_normals
 from pnu.geometry.point_tree import PointTree
-from pnu.geometry.single_view import seen_from_one_side
 from pnu.geometry.unit_sphere import Frame, unit_sphere_frame
 from pnu.io import Cloud, check_cloud
 from pnu.io.library_clouds import Kind, LibraryCloud, kind_of, tensor_like
@@ -197,8 +196,8 @@ def upsample(
         raise ValueError(f"density={density}: expected {', '.join(DENSITIES)}")
     if keep not in (True, False, "auto"):
         raise ValueError(f"keep={keep}: expected true, false or auto")
-    given, _, scanned = clean_cloud(given, outliers=outliers, lines="keep" if keep is True else lines, signs=signs)
-    network, target = on_device(*_model(model, given.normals, scanned, device), device)
+    given, _, character = clean_cloud(given, outliers=outliers, lines="keep" if keep is True else lines, signs=signs)
+    network, target = on_device(*_model(model, given.normals, character, device), device)
     upsampler = upsampler_of(network, patch_size)
     if devices > 1 and not getattr(upsampler, "parallel", False):
         raise ValueError(f"devices={devices}: {type(network).__name__} works in one process; leave devices=1")
@@ -438,12 +437,12 @@ def _short(value: object) -> str:
     return f"{value:g}" if isinstance(value, Real) else repr(value)[:40]
 
 
-def _model(model: Any, normals: np.ndarray | None, scanned: bool, device: str) -> tuple[Any, bool]:
+def _model(model: Any, normals: np.ndarray | None, character: Character, device: str) -> tuple[Any, bool]:
     """The network or upsampler that is meant, and whether it is the caller's own."""
     if isinstance(model, str | PathLike):
         model = LoadedWeights(model)
     if isinstance(model, LoadedWeights):
-        return model.network(normals, scanned, device), False
+        return model.network(normals, character, device), False
     return model, True
 
 
@@ -487,10 +486,10 @@ def _prepare(cloud: Cloud, progress: Progress, *, refine: bool = False) -> tuple
     missing = np.ones(len(order), bool) if given is None else np.isnan(given).any(1)
     if missing.any():
         progress("normals", 0, 1)
-        directions = complete_normals(unit, given)
         if given is None:
-            facing = seen_from_one_side(unit, directions)
-            directions = directions if facing is None else facing
+            directions = settled_normals(cloud.points, None).normals[order]
+        else:
+            directions = complete_normals(unit, given)
         if refine:
             directions = np.where(missing[:, None], learned_normals(unit, directions, progress), directions)
         progress("normals", 1, 1)

@@ -159,12 +159,32 @@ def test_scans_have_the_truth_beside_them(kind: str) -> None:
 @pytest.mark.slow
 def test_scanned_clouds_take_weights_of_their_own() -> None:
     cleaned = clean_cloud(Cloud(lines(noise=0.001), None, {}))
-    assert cleaned.scanned
-    assert weights_source("surface", None, cleaned.scanned) == "surface_scans"
+    assert cleaned.character == "scanned"
+    assert weights_source("surface", None, cleaned.character) == "surface_scans"
     assert weights_source("surface", None) == "surface_estimated"
     dense = pnu.upsample(lines(noise=0.001), ratio=1)
     inside = (np.abs(dense[:, :2] - 0.5) < 0.45).all(1)
     assert np.abs(dense[inside, 2]).mean() < 0.0006  # of 0.0008
+
+
+def test_noisy_clouds_take_weights_of_their_own() -> None:
+    rng = np.random.default_rng(0)
+    unit = rng.normal(size=(2000, 3))
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    noisy = unit + 0.03 * rng.normal(size=unit.shape)
+    assert clean_cloud(Cloud(unit, None, {})).character == "clean"
+    assert clean_cloud(Cloud(noisy, unit, {})).character == "clean"  # where normals are given they tell
+    cleaned = clean_cloud(Cloud(noisy, None, {}))
+    assert cleaned.character == "noisy"
+    assert weights_source("surface", None, cleaned.character) == "surface_noisy"
+    assert weights_source("surface", unit, "noisy") == "surface"
+    off = {name: off_sphere(pnu.upsample(noisy, ratio=2, model=name)) for name in ("surface", "surface_estimated")}
+    assert off["surface"] < 0.8 * off["surface_estimated"]
+
+
+def off_sphere(dense: np.ndarray) -> float:
+    """Mean distance of a cloud from the unit sphere."""
+    return float(np.abs(np.linalg.norm(dense[:, :3], axis=1) - 1).mean())
 
 
 def test_normals_that_contradict_each_other_are_turned_their_axes_kept() -> None:

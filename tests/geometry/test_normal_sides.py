@@ -156,7 +156,7 @@ def test_what_is_done_is_said() -> None:
     assert (some.normals * points).sum(1).min() > 0.9
     np.testing.assert_array_equal(some.normals[1::2], points[1::2])
     sheet = np.hstack([np.random.default_rng(7).uniform(-1, 1, (500, 2)), np.zeros((500, 1))])
-    assert settled_normals(sheet, None).words == "500 estimated; side: to where all of it was seen from, one side"
+    assert settled_normals(sheet, None).words == "500 estimated; side: up, as land that was seen from above"
 
 
 def test_a_part_that_looks_to_the_other_side_is_found_and_turned() -> None:

@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import pnu
-from pnu.geometry.cloud_normals import ONE_SIDE, settled_normals
-from pnu.geometry.single_view import seen_from_one_side, single_view
+from pnu.geometry.cloud_normals import FROM_ABOVE, ONE_SIDE, settled_normals
+from pnu.geometry.single_view import is_camera, seen_from_one_side, single_view
 
 Array = NDArray[np.float64]
 BALLS = np.array(
@@ -58,7 +58,8 @@ def test_all_pieces_look_to_the_camera() -> None:
     sign = np.where(points[:, 0] > 0.25, -1.0, 1.0)
     found = seen_from_one_side(points, true * sign[:, None])
     assert found is not None
-    assert ((found * true).sum(1) < 0).mean() < 1e-3
+    assert ((found.normals * true).sum(1) < 0).mean() < 1e-3
+    assert not found.above
     turn = Rotation.from_euler("xyz", [0.4, 1.1, 2.0]).as_matrix()
     settled = settled_normals(points @ turn.T, None)
     assert ((settled.normals @ turn * true).sum(1) < 0).mean() < 0.005
@@ -78,3 +79,43 @@ def test_dishes_and_cups_of_one_view_look_to_one_side() -> None:
     turn = Rotation.from_euler("xyz", [0.4, 1.1, 2.0]).as_matrix()
     up = (settled_normals(points @ turn.T, None).normals @ turn)[:, 2] > 0
     assert up.mean() < 0.01 or up.mean() > 0.99
+
+
+def room_from_a_camera(across: int = 60) -> tuple[Array, Array]:
+    """Floor, wall and a ball before it as a camera at the origin that looks along z sees them, and true normals."""
+    u, v = (grid.ravel() for grid in np.meshgrid(*[np.linspace(-0.5, 0.5, across)] * 2))
+    rays = np.stack([u, v, np.ones_like(u)], 1)
+    planes = np.array([[0, 0, -1.0, 3.0], [0, -1.0, 0, 1.0]])  # inward normals, and the distance of each
+    with np.errstate(divide="ignore"):
+        depths = np.where(rays @ -planes[:, :3].T > 0, planes[:, 3] / (rays @ -planes[:, :3].T), np.inf)
+    depth, normals = depths.min(1), planes[depths.argmin(1), :3]
+    center, radius = np.array([0.1, 0.2, 2.2]), 0.4
+    b, c = rays @ center, center @ center - radius**2
+    hit = b * b > (rays**2).sum(1) * c
+    near = (b - np.sqrt(np.maximum(b * b - (rays**2).sum(1) * c, 0))) / (rays**2).sum(1)
+    depth = np.where(hit, near, depth)
+    points = depth[:, None] * rays
+    return points, np.where(hit[:, None], (points - center) / radius, normals)
+
+
+def test_the_pixels_of_a_camera_at_the_origin_look_to_it() -> None:
+    points, true = room_from_a_camera()
+    assert is_camera(np.zeros(3), points)
+    settled = settled_normals(points, None)
+    assert ((settled.normals * true).sum(1) < 0).mean() < 0.005
+    assert settled.words == f"{len(points)} estimated; side: towards a camera at the origin, whose pixels they are"
+    dense = pnu.upsample(points, ratio=2)
+    assert ((dense[:, :3] * dense[:, 3:]).sum(1) < 0).mean() > 0.99
+    random = points[np.random.default_rng(0).random(len(points)) < 0.7]
+    for other in (points - [0, 0, 4], points + [0, 0, 100], random, points[:150]):
+        assert not is_camera(np.zeros(3), other)
+
+
+def test_land_looks_up() -> None:
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(0, 100, (2, 3000))
+    land = np.stack([x, y, 4 * np.sin(x / 9) * np.cos(y / 7) + 250], 1)
+    for flipped in (1, -1):
+        settled = settled_normals(land * [1, 1, flipped], None)
+        assert (settled.normals[:, 2] > 0.3).mean() > 0.98
+        assert settled.words == f"3000 estimated; side: {FROM_ABOVE}"

@@ -101,6 +101,8 @@ def test_sides_agree_between_tiles(tmp_path: Path) -> None:
     assert ((dense[:, :3] * dense[:, 3:]).sum(1) > 0).all()
     dense = make(plan_of(tmp_path / "inward", 3 * ball(400), 220, ratio=1.5, side="in"))
     assert ((dense[:, :3] * dense[:, 3:]).sum(1) < 0).all()
+    dense = make(plan_of(tmp_path / "seen", 3 * ball(400) + 7, 220, ratio=1.5, viewpoint="7,7,7"))
+    assert (((dense[:, :3] - 7) * dense[:, 3:]).sum(1) < 0).all()
     for up, sign in (("z", 1), ("-z", -1)):
         dense = make(plan_of(tmp_path / up, sheet(200), 110, ratio=1.5, up=up))
         assert (sign * dense[:, 5] > 0).all()
@@ -129,7 +131,7 @@ def test_lines_strays_and_attributes(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, points, 2100, ratio=1)
     assert len(plan.tiles) == 2
     assert plan.facts.lined
-    assert plan.facts.scanned
+    assert plan.facts.character == "scanned"
     assert tile_work.run_of(plan) == "surface_scans"
     dense = make(plan)
     assert len(dense) == len(points)
