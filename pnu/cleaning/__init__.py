@@ -17,9 +17,9 @@ Treatment = Literal["auto", "keep"]
 TREATMENTS = ("auto", "keep")
 Character = Literal["clean", "scanned", "noisy"]
 """What a cloud is like: clean and scanned ones show little noise, scanned ones lie in lines or have many strays."""
-NOISY = 0.22  # spacings of noise from which on a cloud is noisy; then what looks stray says nothing of scans
+NOISY = 0.17  # spacings of noise from which on a cloud is noisy; then what looks stray says nothing of scans
 
-__all__ = ["TREATMENTS", "Character", "Cleaned", "Treatment", "character_of", "clean_cloud", "stray_points"]
+__all__ = ["TREATMENTS", "Character", "Cleaned", "Treatment", "clean_cloud", "is_noisy", "stray_points"]
 
 
 class Cleaned(NamedTuple):
@@ -28,6 +28,7 @@ class Cleaned(NamedTuple):
     cloud: Cloud  # its notes say what was done
     stray: NDArray[np.int64]  # rows of the cloud before that were taken out as stray
     character: Character = "clean"  # of a cloud without normals; what has them is "clean"
+    estimated: NDArray[np.float64] | None = None  # normals (n, 3) of the cloud, where they had to be known to tell
 
 
 def clean_cloud(
@@ -68,17 +69,17 @@ def clean_cloud(
         settled = settled_normals(cloud.points, cloud.normals)
         notes.append(f"normals: {settled.words} (normals=keep)")
         cloud = cloud._replace(normals=settled.normals)
-    character: Character = "clean"
+    cloud, share = cloud._replace(notes=tuple(notes)), len(stray) / (len(stray) + len(cloud.points))
     if rows is not None:
-        character = "scanned"
-    elif cloud.normals is None:
-        character = character_of(cloud.points, len(stray) / (len(stray) + len(cloud.points)))
-    return Cleaned(cloud._replace(notes=tuple(notes)), stray, character)
+        return Cleaned(cloud, stray, "scanned")
+    if cloud.normals is None and is_noisy(cloud.points):  # or has thin walls, whose sides normals tell apart
+        estimated = settled_normals(cloud.points, None).normals
+        if is_noisy(cloud.points, estimated):
+            return Cleaned(cloud, stray, "noisy", estimated)
+        return Cleaned(cloud, stray, "scanned" if share > MANY else "clean", estimated)
+    return Cleaned(cloud, stray, "scanned" if cloud.normals is None and share > MANY else "clean")
 
 
-def character_of(points: NDArray[np.float64], stray: float = 0.0) -> Character:
-    """Of points (n, 3) without normals, from which a share was taken as stray."""
-    noise = noise_level(points) / spacing(points)
-    if noise > NOISY:
-        return "noisy"
-    return "scanned" if stray > MANY else "clean"
+def is_noisy(points: NDArray[np.float64], normals: NDArray[np.float64] | None = None) -> bool:
+    """Whether points (n, 3), with normals (n, 3) where they are known, show much noise beside their spacing."""
+    return noise_level(points, normals) > NOISY * spacing(points)

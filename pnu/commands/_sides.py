@@ -56,7 +56,8 @@ def sided(cfg: Any, cloud: "Cloud", *, learned: bool = True) -> tuple["Cloud", s
 def cleaned(cfg: Any, cloud: "Cloud", **treatments: Any) -> tuple["Cleaned", "NDArray[np.float64] | None"]:
     """A cloud as `clean_cloud` leaves it, and the normals of its own that it then has.
 
-    Where keys or file say more of the side of normals than the shape of the cloud does, each point has a normal.
+    Where keys or file say more of the side of normals than the shape of the cloud does, or where estimates are known,
+    each point has a normal.
     """
     from pnu.cleaning import clean_cloud
     from pnu.geometry.cloud_normals import sight_by_places
@@ -66,4 +67,8 @@ def cleaned(cfg: Any, cloud: "Cloud", **treatments: Any) -> tuple["Cleaned", "ND
     told = told or sight_of(cfg.input, cloud.attributes) is not None or sight_by_places(cloud.points) is not None
     found = clean_cloud(cloud, **treatments, signs="keep" if told or cfg.normals == "keep" else "auto")
     own = found.cloud.normals
-    return (found._replace(cloud=sided(cfg, found.cloud, learned=False)[0]) if told else found), own
+    if told:
+        found = found._replace(cloud=sided(cfg, found.cloud, learned=False)[0])
+    elif found.estimated is not None and str(cfg.get("keep")).lower() != "true":  # points kept get the network's
+        found = found._replace(cloud=found.cloud._replace(normals=found.estimated))
+    return found, own

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pnu.cleaning import character_of
+from pnu.cleaning import Character, is_noisy
 from pnu.runtime.progress import Progress, silent
 from pnu.upsamplers.context import Context
 from pnu.upsamplers.inference import LoadedWeights, inferring
@@ -19,7 +19,8 @@ def learned_normals(points: Floats, normals: Floats, progress: Progress = silent
     As `pnu upsample` has them where a cloud comes without: the shipped network sees each point's neighbors with their
     rough normals, then with its own; in a noisy cloud also once its points lie on the surface.
     """
-    network = LoadedWeights("surface").network(character=character_of(points), device="cpu")
+    character: Character = "noisy" if is_noisy(points, normals) else "clean"
+    network = LoadedWeights("surface").network(character=character, device="cpu")
     with inferring(network):
         upsampler, context = SurfaceProjection(network), Context(progress=progress)
         cloud = np.hstack([points, normals])

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnu import __version__
-from pnu.cleaning import Character, character_of, stray_points
+from pnu.cleaning import Character, is_noisy, stray_points
 from pnu.cleaning.outliers import MANY
 from pnu.geometry.anisotropy import thinned_lines
 from pnu.geometry.cells import Cells
@@ -400,7 +400,6 @@ def _look(points: np.ndarray, normals: np.ndarray | None, keys: Keys, size: int)
     look: dict[str, Any] = {"points": size, "stray": float(stray.mean()), "heights": is_height_map(points)}
     points, normals = points[~stray], None if normals is None else normals[~stray]
     look["apart_raw"] = float(np.quantile(local_spacing(points), 0.9))
-    look["loud"] = character_of(points) == "noisy"
     look["turned"] = "" if normals is None else contradiction(points, normals)
     thinned = thinned_lines(points) if normals is None else None
     look["lined"] = None
@@ -412,6 +411,7 @@ def _look(points: np.ndarray, normals: np.ndarray | None, keys: Keys, size: int)
     scale = np.abs(points - points.mean(0)).max()
     cloud = np.hstack([(points - points.mean(0)) / scale, known])
     look["noisy"] = noise_in_spacings(cloud) > SMOOTH
+    look["loud"] = is_noisy(points, known)
     look["even"] = thinned is None and is_clean_and_even(cloud)
     return look
 

@@ -196,13 +196,15 @@ def upsample(
         raise ValueError(f"density={density}: expected {', '.join(DENSITIES)}")
     if keep not in (True, False, "auto"):
         raise ValueError(f"keep={keep}: expected true, false or auto")
-    given, _, character = clean_cloud(given, outliers=outliers, lines="keep" if keep is True else lines, signs=signs)
+    given, _, character, estimated = clean_cloud(
+        given, outliers=outliers, lines="keep" if keep is True else lines, signs=signs
+    )
     network, target = on_device(*_model(model, given.normals, character, device), device)
     upsampler = upsampler_of(network, patch_size)
     if devices > 1 and not getattr(upsampler, "parallel", False):
         raise ValueError(f"devices={devices}: {type(network).__name__} works in one process; leave devices=1")
     names = _names(target, devices)
-    sparse, frame = _prepare(given, progress, refine=not getattr(network, "passes", 0))
+    sparse, frame = _prepare(given, progress, estimated, refine=not getattr(network, "passes", 0))
     if not getattr(upsampler, "follows", False) and (density == "follow" or keep is True):
         asked = "density=follow" if density == "follow" else "keep=true"
         raise ValueError(
@@ -475,10 +477,13 @@ def _digest(network: Any, sparse: np.ndarray, count: int, upsampler: object, *op
     return digest.hexdigest()[:16]
 
 
-def _prepare(cloud: Cloud, progress: Progress, *, refine: bool = False) -> tuple[np.ndarray, Frame]:
+def _prepare(
+    cloud: Cloud, progress: Progress, estimated: np.ndarray | None = None, *, refine: bool = False
+) -> tuple[np.ndarray, Frame]:
     """The points in a fixed order with normals, (n, 6) float64 in the unit sphere, and the way back.
 
-    refine: normals that are missing are found by the surface model, not left to a network that does so itself.
+    estimated: normals (n, 3), known already, that a cloud without any gets. refine: those that are missing are found by
+    the surface model, not left to a network that does so itself.
     """
     order = np.lexsort(cloud.points.T)
     unit, frame = _unit_sphere(cloud.points[order])
@@ -487,7 +492,7 @@ def _prepare(cloud: Cloud, progress: Progress, *, refine: bool = False) -> tuple
     if missing.any():
         progress("normals", 0, 1)
         if given is None:
-            directions = settled_normals(cloud.points, None).normals[order]
+            directions = (settled_normals(cloud.points, None).normals if estimated is None else estimated)[order]
         else:
             directions = complete_normals(unit, given)
         if refine:
