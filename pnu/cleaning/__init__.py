@@ -18,6 +18,7 @@ TREATMENTS = ("auto", "keep")
 Character = Literal["clean", "scanned", "noisy"]
 """What a cloud is like: clean and scanned ones show little noise, scanned ones lie in lines or have many strays."""
 NOISY = 0.17  # spacings of noise from which on a cloud is noisy; then what looks stray says nothing of scans
+MANY_ENOUGH = 1000  # points that tell noise from what they do not resolve
 
 __all__ = ["TREATMENTS", "Character", "Cleaned", "Treatment", "clean_cloud", "is_noisy", "stray_points"]
 
@@ -81,5 +82,8 @@ def clean_cloud(
 
 
 def is_noisy(points: NDArray[np.float64], normals: NDArray[np.float64] | None = None) -> bool:
-    """Whether points (n, 3), with normals (n, 3) where they are known, show much noise beside their spacing."""
-    return noise_level(points, normals) > NOISY * spacing(points)
+    """Whether points (n, 3), with normals (n, 3) where they are known, show much noise beside their spacing.
+
+    Never fewer than 1000: walls that so few do not resolve look like noise, with normals too.
+    """
+    return len(points) >= MANY_ENOUGH and noise_level(points, normals) > NOISY * spacing(points)
