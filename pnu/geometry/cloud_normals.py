@@ -135,14 +135,15 @@ def _signs(
         sign, by = repaired_signs(unit, lines)
         return sign, OUTWARD if by == "outward" else "that of most given"
     oriented = orient_normals(unit, lines) if known.any() else lines
-    facing = seen_from_one_side(unit, oriented)
+    closed = is_closed(NeighborCloud.of(unit), oriented.astype(np.float32))
+    # plates too thin to lie behind themselves are closed all the same
+    facing = None if closed else seen_from_one_side(unit, oriented)
     oriented = oriented if facing is None else facing.normals
     sign = np.where((oriented * lines).sum(1) < 0, -1.0, 1.0)
     if sight is not None:
         return (-sign if sight.inward else sign), sight.words
     if facing is not None:
         return sign, FROM_ABOVE if facing.above else ONE_SIDE
-    closed = is_closed(NeighborCloud.of(unit), oriented.astype(np.float32))
     return sign, OUTWARD if closed else "one and the same over an open surface"
 
 

@@ -81,6 +81,20 @@ def test_dishes_and_cups_of_one_view_look_to_one_side() -> None:
     assert up.mean() < 0.01 or up.mean() > 0.99
 
 
+@pytest.mark.parametrize("thickness", [0.06, 0.12])
+def test_thin_plates_have_two_sides(thickness: float) -> None:
+    rng = np.random.default_rng(2)
+    face = rng.uniform(-1, 1, (2000, 2))
+    around = rng.uniform(-1, 1, (300, 2)) * [1, thickness / 2]
+    sides = [np.stack([around[:, 0], np.sign(rng.normal(size=300)), around[:, 1]], 1)]
+    sides.append(sides[0][:, [1, 0, 2]])
+    points = np.vstack([np.c_[face, np.where(rng.random(2000) < 0.5, 1, -1) * thickness / 2], *sides])
+    settled = settled_normals(points @ Rotation.from_euler("xyz", [0.3, 0.5, 0.7]).as_matrix().T, None)
+    up = (settled.normals @ Rotation.from_euler("xyz", [0.3, 0.5, 0.7]).as_matrix())[:2000, 2]
+    assert (up * points[:2000, 2] > 0).mean() > 0.98
+    assert settled.words.endswith("outward, by the winding field")
+
+
 def room_from_a_camera(across: int = 60) -> tuple[Array, Array]:
     """Floor, wall and a ball before it as a camera at the origin that looks along z sees them, and true normals."""
     u, v = (grid.ravel() for grid in np.meshgrid(*[np.linspace(-0.5, 0.5, across)] * 2))
