@@ -12,6 +12,7 @@ import numpy as np
 from pnu.data.mesh_scene import ray_casting_scene
 from pnu.extras import needed
 from pnu.geometry.mesh_sampling import sample_area, sample_poisson_disk
+from pnu.geometry.sphere_directions import sphere_directions
 from pnu.io import Mesh
 
 STEEPEST = 0.3  # cosine of incidence below which noise along the ray grows no further
@@ -158,19 +159,19 @@ class Scanner:
 
 def orbit(scanner: Scanner, rng: np.random.Generator) -> SimulatedScan:
     """Structured light from ten sides, the views not quite aligned."""
-    return scanner.views(3.0 * sphere_directions(10, rng), DepthCamera(turn=0.2, shift=0.002), rng)
+    return scanner.views(3.0 * sphere_directions(10, random_turn(rng)), DepthCamera(turn=0.2, shift=0.002), rng)
 
 
 def oneview(scanner: Scanner, rng: np.random.Generator) -> SimulatedScan:
     """One depth camera: one side only, depth in steps, points torn off at edges."""
     camera = DepthCamera(half=0.42, across=110, down=110, slant=0.1, step=0.004, torn=0.25)
-    return scanner.views(2.6 * sphere_directions(7, rng)[rng.integers(7)][None], camera, rng)
+    return scanner.views(2.6 * sphere_directions(7, random_turn(rng))[rng.integers(7)][None], camera, rng)
 
 
 def lines(scanner: Scanner, rng: np.random.Generator) -> SimulatedScan:
     """A laser from four places, ten times as dense along a line as across lines."""
     camera = DepthCamera(half=0.38, across=260, down=26, noise=0.0015, slant=0.12)
-    return scanner.views(2.8 * sphere_directions(4, rng), camera, rng)
+    return scanner.views(2.8 * sphere_directions(4, random_turn(rng)), camera, rng)
 
 
 def photo(scanner: Scanner, rng: np.random.Generator) -> SimulatedScan:
@@ -215,15 +216,12 @@ def any_scan(scanner: Scanner, rng: np.random.Generator) -> SimulatedScan:
         count, down = int(rng.integers(1, 6)), int(_log_uniform(rng, 16, 45))
         size = int(down * _log_uniform(rng, 3, 16)), down
     camera = replace(camera, across=size[0], down=size[1])
-    return scanner.views(distance * sphere_directions(max(count, 3), rng)[:count], camera, rng)
+    return scanner.views(distance * sphere_directions(max(count, 3), random_turn(rng))[:count], camera, rng)
 
 
-def sphere_directions(count: int, rng: np.random.Generator) -> np.ndarray:
-    """Evenly spread directions (count, 3), turned at random about the z axis: a spiral of golden angles."""
-    i = np.arange(count) + 0.5
-    angle, z = np.pi * (1 + np.sqrt(5)) * i + rng.uniform(0, 2 * np.pi), 1 - 2 * i / count
-    radius = np.sqrt(1 - z * z)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
+def random_turn(rng: np.random.Generator) -> float:
+    """An angle for `sphere_directions`."""
+    return float(rng.uniform(0, 2 * np.pi))
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:

@@ -17,6 +17,7 @@ from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.normal_sides import voted_signs
 from pnu.geometry.point_tree import PointTree
 from pnu.geometry.spacing import spacing
+from pnu.geometry.sphere_directions import sphere_directions
 from pnu.runtime.threads import thread_count
 
 Floats = NDArray[np.float64]
@@ -61,7 +62,7 @@ def single_view(points: Floats) -> Floats | None:
         return None
     if len(points) > MOST:
         points = points[farthest_points_large(points, MOST)]
-    apart, directions = spacing(points), _directions()
+    apart, directions = spacing(points), sphere_directions(2 * DIRECTIONS)[:DIRECTIONS]
     behind = np.array([_share_behind(points, direction, apart) for direction in directions])
     if behind.min() > min(CLEAR, SHARE * float(np.median(behind))):
         return None
@@ -90,14 +91,6 @@ def seen_from_one_side(points: Floats, normals: Floats) -> OneSide | None:
     turned = view[2] < 0 if land else along.sum() < 0
     signs = voted_signs(points, normals, -along if turned else along)
     return OneSide(normals * signs[:, None], land)
-
-
-def _directions() -> Floats:
-    """Evenly spread over a half of the sphere, (DIRECTIONS, 3)."""
-    i = np.arange(DIRECTIONS) + 0.5
-    angle, z = np.pi * (1 + np.sqrt(5)) * i, i / DIRECTIONS
-    radius = np.sqrt(1 - z * z)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
 
 
 def _share_behind(points: Floats, direction: Floats, apart: float) -> float:
