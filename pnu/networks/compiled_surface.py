@@ -25,8 +25,8 @@ WIDTHS = {  # layers: rows and columns of their weights, in widths of the networ
 }  # fmt: skip
 OUT, PREFIX = 7, "projector."
 SETTINGS = (
-    "ratio", "neighbors", "reach", "seeds", "candidates", "shortlist", "relaxation", "refinements", "reject", "passes",
-    "sphere", "attention",
+    "ratio", "neighbors", "reach", "seeds", "candidates", "shortlist", "relaxation", "refinements", "reject", "slide",
+    "passes", "sphere", "attention",
 )  # fmt: skip
 TRAINING = ("width", "rounds", "queries", "smoothing", "refining")  # that nothing here depends on
 
@@ -50,6 +50,7 @@ class CompiledSurface:
     relaxation: int
     refinements: int
     reject: float
+    slide: float
     passes: int
     sphere: bool
     attention: bool
@@ -132,7 +133,8 @@ def read_compiled(source: str | PathLike[str]) -> CompiledSurface | None:
         found = weights.read(path, "numpy")
     except (ValueError, TypeError):  # types that NumPy has not, say
         return None
-    settings = {"passes": 0} | {key.replace("neighbour", "neighbor"): value for key, value in found.model.items()}
+    settings = {key.replace("neighbour", "neighbor"): value for key, value in found.model.items()}
+    settings = {"passes": 0, "slide": 1} | settings
     parameters = {name.removeprefix(PREFIX): value for name, value in found.state.items() if name.startswith(PREFIX)}
     target = present_name(str(settings.pop("_target_", "")))
     fits = target == TARGET and {*SETTINGS} <= {*settings} <= {*SETTINGS, *TRAINING}
@@ -152,4 +154,5 @@ def _sound(settings: Mapping[str, Any]) -> bool:
         and 4 <= settings["neighbors"] <= settings["reach"]
         and all(settings[name] >= 1 for name in one)
         and min(settings["reject"], settings["passes"]) >= 0
+        and 0 <= settings["slide"] <= 1
     )

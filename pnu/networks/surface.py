@@ -87,6 +87,8 @@ class Surface(nn.Module):
         relaxation: steps of even spacing; 0: none
         refinements: projections after the even spacing; one more is nearer to the surface and a little less even
         reject: share of points made too many; the worst of their surroundings by expected error are dropped
+        slide: share of their way along the surface that points make in a refinement; less than all leaves points at tips
+            and creases, from where the network draws them, and is a little less near to the surface
         queries: seeds of a crop, in training
         smoothing: share of the crops in training whose inner points are themselves projected first, as those of a noisy
             cloud are at work
@@ -103,7 +105,7 @@ class Surface(nn.Module):
     def __init__(
         self, ratio: int = 4, neighbors: int = 24, reach: int = 24, width: int = 64, rounds: int = 2,
         seeds: float = 4, candidates: float = 2, shortlist: float = 1.15,
-        relaxation: int = 2, refinements: int = 2, reject: float = 0.003,
+        relaxation: int = 2, refinements: int = 2, reject: float = 0.003, slide: float = 1.0,
         queries: int = 64, smoothing: float = 0.0, refining: float = 0.0, passes: int = 0,
         sphere: bool = True, attention: bool = True,
     ) -> None:  # fmt: skip
@@ -118,12 +120,12 @@ class Surface(nn.Module):
         for name in ("rounds", "seeds", "candidates", "shortlist", "refinements", "queries"):
             if getattr(self, name) < 1:  # too few seeds would be too few points
                 raise ValueError(f"model.{name}={getattr(self, name)}: expected at least 1")
-        for name, share in (("smoothing", smoothing), ("refining", refining)):
+        for name, share in (("smoothing", smoothing), ("refining", refining), ("slide", slide)):
             if not 0 <= share <= 1:
                 raise ValueError(f"model.{name}={share}: expected a share from 0 to 1")
         if passes < 0:
             raise ValueError(f"model.passes={passes}: expected 0 or more")
-        self.smoothing, self.refining, self.passes = smoothing, refining, passes
+        self.smoothing, self.refining, self.passes, self.slide = smoothing, refining, passes, slide
         self.projector = Projector(width, sphere=sphere, attention=attention)
 
     def check_input(self, key: str, points: int) -> None:

@@ -124,7 +124,8 @@ class SurfaceProjection:
         if network.relaxation:
             query = named("even spacing", lambda step: even_out(query, network.relaxation, step, kept))
         for i in range(network.refinements):
-            query, error = self.projected(query, cloud, context, f"refinement {i + 1}")
+            refined, error = self.projected(query, cloud, context, f"refinement {i + 1}")
+            query = slid(query, refined, network.slide)
         query = query[reject_worst(query[:, :3], error, new)]
         if first == len(cloud):  # of a part others make what lies at its borders
             query = self.covering(query, kept, cloud, context)
@@ -294,6 +295,15 @@ def seeds_around(cloud: Floats, each: int, count: int, step: Step = silent, *, f
     else:
         kept = farthest_points_large(places, count, step=step)
     return np.hstack([places[kept], cloud[owner[kept], 3:]])
+
+
+def slid(query: Floats, refined: Floats, share: float) -> Floats:
+    """Queries (m, 6) moved as refined (m, 6), but along the surface only that share of the way; normals as refined."""
+    if share == 1:
+        return refined
+    step, normals = refined[:, :3] - query[:, :3], refined[:, 3:]
+    along = step - (step * normals).sum(1, keepdims=True) * normals
+    return np.hstack([refined[:, :3] - (1 - share) * along, normals])
 
 
 def reject_worst(points: Floats, error: Floats, count: int) -> Index:

@@ -15,7 +15,7 @@ from pnu.geometry.transforms import rotation_matrix
 from pnu.networks.surface import Projector, Surface
 from pnu.upsamplers import Context, SurfaceProjection
 from pnu.upsamplers import surface_projection as procedure
-from pnu.upsamplers.surface_projection import approached, reject_worst
+from pnu.upsamplers.surface_projection import approached, reject_worst, slid
 
 
 def upsample(network: Surface, cloud: Tensor, count: int, **options: Any) -> Tensor:
@@ -349,6 +349,17 @@ def test_less_than_one_is_refused(name: str) -> None:
 def test_a_negative_share_of_rejected_points_is_refused() -> None:
     with pytest.raises(ValueError, match=r"model\.reject=-0\.1: expected a share"):
         Surface(reject=-0.1)
+
+
+def test_along_the_surface_points_go_a_share_of_the_way() -> None:
+    query, normal = np.array([[1, 1, 1, 1, 0, 0.0]]), [0.6, 0, 0.8]
+    refined = np.array([[1 + 0.6 * 2 + 0.8, 4, 1 + 0.8 * 2 - 0.6, *normal]])  # 2 along the normal, (1, 3) across
+    np.testing.assert_array_equal(slid(query, refined, 1), refined)
+    half = [[1 + 0.6 * 2 + 0.4, 2.5, 1 + 0.8 * 2 - 0.3, *normal]]
+    np.testing.assert_allclose(slid(query, refined, 0.5), half, atol=1e-15)
+    np.testing.assert_allclose(slid(query, refined, 0), [[2.2, 1, 2.6, *normal]], atol=1e-15)
+    with pytest.raises(ValueError, match=r"model\.slide=1\.1: expected a share from 0 to 1"):
+        Surface(slide=1.1)
 
 
 def test_training_seeds_are_spread_and_pushed_outward() -> None:

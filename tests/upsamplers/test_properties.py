@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -218,6 +219,45 @@ def test_every_point_given_has_one_within_half_a_spacing(shape: str, ratio: floa
     share = cKDTree(dense[:, :3]).query(cloud[:, :3])[0] / around
     assert (share > 0.5).mean() < 0.005  # a tip may end a little before its point
     assert share.max() < 0.7
+
+
+@pytest.mark.slow
+def test_noisy_creases_keep_their_points() -> None:
+    """Gaps along creases are smaller than where refinements move points as far as the network says."""
+    gaps: dict[str, list[float]] = {"ships": [], "slides": []}
+    for shape, seed in (("mug", 0), ("bracket", 0), ("mug", 1), ("bracket", 1)):
+        mesh, rng = shapes.make(shape), np.random.default_rng(seed)
+        points = sample_area(mesh, 1500, rng)[:, :3] + 0.01 * rng.standard_normal((1500, 3))
+        for kind, changed in (("ships", {}), ("slides", {"slide": 1.0, "reject": 0.003})):
+            network = pnu.load("surface_noisy")
+            vars(network).update(changed)
+            dense = pnu.upsample(points, model=network, keep=False)
+            gaps[kind].append(float(np.quantile(cKDTree(dense[:, :3]).query(along_creases(mesh))[0], 0.95)))
+    assert np.mean(gaps["ships"]) < 0.97 * np.mean(gaps["slides"])
+
+
+def along_creases(mesh: Any) -> Array:
+    """Points of the edges where two faces meet at 35 degrees and more, (n, 3)."""
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
+    ends = solid.vertices[solid.face_adjacency_edges[solid.face_adjacency_angles > np.radians(35)]]
+    share = np.linspace(0, 1, 20)[:, None]
+    found: Array = (ends[:, None, 0] * share + ends[:, None, 1] * (1 - share)).reshape(-1, 3)
+    return found
+
+
+@pytest.mark.parametrize(("axis", "noise"), [(1.0, 0.02), (0.4, 0.01)])
+def test_noise_shrinks_nothing(axis: float, noise: float) -> None:
+    """A sphere, and an ellipsoid with tips: mean distance from the true surface, inside or outside, in noises."""
+    size = np.array([1, axis, axis])
+    solid = trimesh.creation.icosphere(5).apply_scale(size)
+    points, _ = trimesh.sample.sample_surface(solid, 2500, seed=1)
+    points = points + noise * np.random.default_rng(1).standard_normal(points.shape)
+    dense = pnu.upsample(points)[:, :3]
+    level = np.linalg.norm(dense / size, axis=1)  # 1 on the surface; its slope makes a distance of the difference
+    outside = (level - 1) * level / np.linalg.norm(dense / size**2, axis=1)
+    assert abs(outside.mean()) < 0.1 * noise
+    assert abs(outside[np.abs(dense[:, 0]) > 0.9].mean()) < 0.2 * noise
+    assert abs(np.abs(dense[:, 0]).max() - 1) < 0.6 * noise
 
 
 def test_metrics_depend_neither_on_threads_nor_on_the_order_of_files() -> None:
