@@ -20,6 +20,7 @@ from pnu.commands.upsample import main
 from pnu.config.compose import parse
 from pnu.config.quoting import override
 from pnu.io import read_cloud, write_cloud
+from tests.io.test_point_stream import write_copc
 from tests.refusals import ran, refused
 
 NASTY = "it's a=b, (c)"
@@ -87,6 +88,24 @@ def test_single_tiles_by_hand(place: Path) -> None:
     assert "tiles=7: expected one of 2 tiles, 0 to 1" in tiled(place, "output=dense.ply", "tiles=7").stderr
     assert tiled(place, "output=dense.ply", "tiles=all").returncode == 0
     assert len(read_cloud(place / "dense.ply").points) == 600
+
+
+@pytest.mark.slow
+def test_copc_gives_what_plain_laz_gives(place: Path) -> None:
+    laspy = pytest.importorskip("laspy")
+    points = write_copc(place / "cloud.copc.laz", read_cloud(place / "cloud.ply").points)
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales = np.full(3, 1e-3)
+    plain = laspy.LasData(header)
+    plain.xyz = points
+    plain.write(place / "cloud.laz")
+    for name in ("cloud.copc", "cloud"):
+        done = tiled(place, f"input={name}.laz", f"output={name}.npy", "memory=4GiB")
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.splitlines()[2].startswith("tiles:  2, ")
+    dense = np.load(place / "cloud.copc.npy")
+    assert dense.shape == (600, 6)
+    np.testing.assert_array_equal(dense, np.load(place / "cloud.npy"))
 
 
 BAD = {
