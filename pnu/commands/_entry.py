@@ -78,6 +78,8 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
 
         hydra = HydraConfig.get()
         try:
+            if not hydra.job.chdir:  # a launcher's processes may have been started elsewhere
+                os.chdir(hydra.runtime.cwd)
             cfg, left = fitted(cfg, hydra, schema, hydra.overrides.task)
             if left and not cfg.get("quiet"):
                 print(said(left, hydra.runtime.choices), file=sys.stderr)
@@ -115,7 +117,7 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
             modes = [mode for mode in ("run", "multirun", "cfg", "info", "shell_completion") if getattr(parsed, mode)]
             if len(modes) > 1:
                 raise ValueError(f"--{modes[0]} and --{modes[1]}: one of them at a time")
-            overrides = [o for o in parsed.overrides if not o.startswith("hydra.")]
+            overrides = [o for o in parsed.overrides if not is_hydras(o)]
             goes_on = parsed.multirun and "trainer" in fields(schema)
             with composer(name, parsed.config_dir) as compose:
                 if parsed.help:
@@ -131,7 +133,7 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
                     added = sweeps.sweep_arguments(overrides, name)
                     arguments += added
                     parsed.overrides += added
-                    overrides += [o for o in added if not o.startswith("hydra.")]
+                    overrides += [o for o in added if not is_hydras(o)]
                 respelled = dict(zip(overrides, spell(overrides, schema, compose), strict=True))
                 overrides = list(respelled.values())
                 arguments = [respelled.get(argument, argument) for argument in arguments]
@@ -152,11 +154,14 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
                             raise ValueError(f"{asked}: makes the jobs of one run; give each key one value")
                 if parsed.cfg == "job" and not parsed.multirun:
                     added = folder_arguments(compose([*overrides, *hydras_own(parsed.overrides)], True), schema)
-                    overrides += [o for o in added if not o.startswith("hydra.")]
+                    overrides += [o for o in added if not is_hydras(o)]
                     print(printed(overrides, schema, compose, parsed.package, resolve=parsed.resolve), end="")
                     return
+                if parsed.multirun:
+                    composed = compose([*next(variations(overrides)), *hydras_own(parsed.overrides)], True)
+                    hydra_config = composed.hydra
+                    arguments += launcher_arguments(composed)
                 if goes_on:
-                    hydra_config = compose([*next(variations(overrides)), *hydras_own(parsed.overrides)], True).hydra
                     Path(hydra_config.sweep.dir).mkdir(parents=True, exist_ok=True)
                     arguments += optuna_search.search_arguments(hydra_config)
                 elif not parsed.multirun and not parsed.cfg:
@@ -220,7 +225,23 @@ def run_in_jobs(
 
 def hydras_own(overrides: Sequence[str]) -> list[str]:
     """The overrides of Hydra's own keys."""
-    return [override for override in overrides if override.startswith("hydra.")]
+    return [override for override in overrides if is_hydras(override)]
+
+
+def is_hydras(override: str) -> bool:
+    """Whether an override sets a key of Hydra's own, or adds one to it or deletes one."""
+    return override.lstrip("+~").startswith("hydra.")
+
+
+def launcher_arguments(config: Any) -> list[str]:
+    """What a launcher needs that its plugin does not say.
+
+    That for Ray asks for an object store of its own size, which Ray refuses where a cluster runs already.
+    """
+    ray = config.hydra.runtime.choices.get("hydra/launcher") == "ray"
+    if ray and "object_store_memory" not in config.hydra.launcher.ray.init:
+        return ["+hydra.launcher.ray.init.object_store_memory=null"]
+    return []
 
 
 def folder_arguments(config: Any, schema: type) -> list[str]:

@@ -78,7 +78,8 @@ def job_folder(config: Mapping[str, Any]) -> RunFolder:
     from hydra.core.hydra_config import HydraConfig
 
     hydra = HydraConfig.get()
-    sweep, digest = Path(hydra.runtime.output_dir), config_hash(config)
+    # not of the job's own idea of where it runs: a launcher's processes may have been started elsewhere
+    sweep, digest = Path(hydra.runtime.cwd, hydra.sweep.dir, hydra.sweep.subdir), config_hash(config)
     label = label_of(str(hydra.job.override_dirname)) or str(config["name"])
     found = [run for run in runs(sweep) if read_json(run.record_path).get("config_hash") == digest]
     folder = found[0] if found else RunFolder(sweep / f"{label}_{digest[:8]}")

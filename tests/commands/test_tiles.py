@@ -2,11 +2,14 @@
 
 import contextlib
 import os
+import re
 import shlex
 import signal
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +20,7 @@ from pnu.commands.upsample import main
 from pnu.config.compose import parse
 from pnu.config.quoting import override
 from pnu.io import read_cloud, write_cloud
+from tests.io.test_point_stream import write_copc
 from tests.refusals import ran, refused
 
 NASTY = "it's a=b, (c)"
@@ -86,6 +90,24 @@ def test_single_tiles_by_hand(place: Path) -> None:
     assert len(read_cloud(place / "dense.ply").points) == 600
 
 
+@pytest.mark.slow
+def test_copc_gives_what_plain_laz_gives(place: Path) -> None:
+    laspy = pytest.importorskip("laspy")
+    points = write_copc(place / "cloud.copc.laz", read_cloud(place / "cloud.ply").points)
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales = np.full(3, 1e-3)
+    plain = laspy.LasData(header)
+    plain.xyz = points
+    plain.write(place / "cloud.laz")
+    for name in ("cloud.copc", "cloud"):
+        done = tiled(place, f"input={name}.laz", f"output={name}.npy", "memory=4GiB")
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.splitlines()[2].startswith("tiles:  2, ")
+    dense = np.load(place / "cloud.copc.npy")
+    assert dense.shape == (600, 6)
+    np.testing.assert_array_equal(dense, np.load(place / "cloud.npy"))
+
+
 BAD = {
     "memory=much": "memory=much: expected a size such as 4GiB or 1500MiB",
     "memory=100MiB": "memory=100MiB: is too little for this ratio; expected at least ",
@@ -132,7 +154,6 @@ def small_memory() -> str:
 LAUNCHERS = {
     "joblib": ("loky.backend.popen_loky", ["hydra.launcher.n_jobs=2"]),
     "submitit_local": ("submitit.core._submit", []),
-    "ray": ("ray::", ["hydra.launcher.ray.init.num_cpus=2"]),
 }
 
 
@@ -141,22 +162,83 @@ LAUNCHERS = {
 def test_a_worker_that_is_killed_changes_nothing(tmp_path: Path, launcher: str) -> None:
     pytest.importorskip({"submitit_local": "submitit"}.get(launcher, launcher))
     worker, options = LAUNCHERS[launcher]
+    with one_worker_killed(tmp_path, [f"hydra/launcher={launcher}", *options], worker) as (whole, jobs, _):
+        np.testing.assert_array_equal(jobs, whole)
+
+
+@pytest.mark.slow
+def test_a_worker_of_a_ray_cluster_that_is_killed_changes_nothing(tmp_path: Path) -> None:
+    """Ray gives its job to another one, so that the command itself has nothing left to do."""
+    pytest.importorskip("hydra_plugins.hydra_ray_launcher")
+    place = tmp_path / "place"
+    place.mkdir()
+    with (
+        ray_cluster() as (cluster, address),
+        one_worker_killed(place, ["hydra/launcher=ray"], "ray::_run_job", cluster, RAY_ADDRESS=address) as found,
+    ):
+        whole, jobs, said = found
+        np.testing.assert_array_equal(jobs, whole)
+        assert "ended early" not in said
+        assert "made, " in said
+
+
+@contextlib.contextmanager
+def one_worker_killed(
+    place: Path, launcher: Sequence[str], worker: str, cluster: int | None = None, **environment: str
+) -> Iterator[tuple[np.ndarray, np.ndarray, str]]:
+    """Points of a single process, those by a launcher of whose workers one is killed, and what was said.
+
+    worker: words in the line of its process; cluster: the process whose descendants workers are, the command's without.
+    """
     xy = np.random.default_rng(0).uniform(0, 70, (5000, 2))
-    np.save(tmp_path / "cloud.npy", np.column_stack([xy, np.sin(xy[:, 0] / 9)]))
+    np.save(place / "cloud.npy", np.column_stack([xy, np.sin(xy[:, 0] / 9)]))
     keys = [sys.executable, "-m", "pnu", "upsample", "input=cloud.npy", "ratio=1", "up=z", small_memory()]
-    subprocess.run([*keys, "output=whole.npy", "quiet=true"], cwd=tmp_path, check=True)
-    command = [*keys, "-m", "output=jobs.npy", "tiles=all", f"hydra/launcher={launcher}", *options]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as child:
+    subprocess.run([*keys, "output=whole.npy", "quiet=true"], cwd=place, check=True)
+    command = [*keys, "-m", "output=jobs.npy", "tiles=all", *launcher]
+    given = {**os.environ, **environment}
+    with subprocess.Popen(
+        command, cwd=place, env=given, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as child:
         assert child.stdout is not None
-        while child.poll() is None and not list(tmp_path.glob("jobs.npy.parts/tiles_*/share_*")):
+        while child.poll() is None and not list(place.glob("jobs.npy.parts/tiles_*/share_*")):
             time.sleep(0.05)
-        workers = [pid for pid in descendants(child.pid) if worker in command_line(pid)]
-        assert workers
-        os.kill(workers[-1], signal.SIGKILL)
+        workers = [pid for pid in descendants(cluster or child.pid) if worker in command_line(pid)]
+        if workers:
+            os.kill(workers[-1], signal.SIGKILL)
         said = child.stdout.read()
+    assert workers, said
     assert child.returncode == 0, said
-    np.testing.assert_array_equal(np.load(tmp_path / "jobs.npy"), np.load(tmp_path / "whole.npy"))
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["cloud.npy", "jobs.npy", "whole.npy"]
+    yield np.load(place / "whole.npy"), np.load(place / "jobs.npy"), said
+    assert sorted(path.name for path in place.iterdir()) == ["cloud.npy", "jobs.npy", "whole.npy"]
+
+
+@contextlib.contextmanager
+def ray_cluster() -> Iterator[tuple[int, str]]:
+    """A cluster of two workers that runs in a folder of its own: its process and its address."""
+    start = "ray start --head --block --port=0 --num-cpus=2 --include-dashboard=false --disable-usage-stats"
+    given = {**os.environ, "RAY_agent_register_timeout_ms": "300000"}  # a busy machine takes its time
+    with tempfile.TemporaryDirectory() as folder:  # a path short enough for sockets
+        command = [str(Path(sys.executable).with_name("ray")), *start.split()[1:], f"--temp-dir={folder}"]
+        with subprocess.Popen(
+            command, cwd=folder, env=given, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        ) as child:
+            assert child.stdout is not None
+            try:
+                told = ""
+                while not (found := re.search(r"ray start --address='([^']+)'", told)):
+                    line = child.stdout.readline()
+                    assert line, told
+                    told += line
+                yield child.pid, found[1]
+            finally:
+                started = descendants(child.pid)
+                child.terminate()
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    child.communicate(timeout=60)
+                for pid in [child.pid, *started]:
+                    if "ray" in command_line(pid):
+                        with contextlib.suppress(OSError):
+                            os.kill(pid, signal.SIGKILL)
 
 
 def descendants(pid: int) -> list[int]:

@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 
 import pnu
 from pnu.commands._arguments import renamed
-from pnu.commands._entry import command
+from pnu.commands._entry import command, launcher_arguments
 from pnu.commands.compare import Compare
 from pnu.commands.train import Train
 from pnu.commands.train import main as train
@@ -229,6 +229,20 @@ def test_command_ends_well_and_writes_nothing_of_its_own(script: Any, tmp_path: 
     done = script("input=a", "output=b", "ratio=2")
     assert (done.returncode, done.stdout, done.stderr) == (0, "worked 2.0\n", "")
     assert [path.name for path in tmp_path.iterdir()] == ["tool.py"]
+
+
+def test_a_key_may_be_added_to_hydras_own(script: Any) -> None:
+    done = script("input=a", "output=b", "ratio=2", "+hydra.job.env_set.MINE=1")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "worked 2.0\n", "")
+
+
+@pytest.mark.parametrize(
+    ("choice", "given", "added"), [("ray", {}, 1), ("ray", {"object_store_memory": 9}, 0), ("a", {}, 0)]
+)
+def test_ray_is_left_its_own_object_store(choice: str, given: dict[str, int], added: int) -> None:
+    hydra = {"runtime": {"choices": {"hydra/launcher": choice}}, "launcher": {"ray": {"init": given}}}
+    found = launcher_arguments(OmegaConf.create({"hydra": hydra}))
+    assert found == ["+hydra.launcher.ray.init.object_store_memory=null"][:added]
 
 
 @pytest.mark.parametrize(

@@ -46,6 +46,41 @@ def test_slices_are_the_file(tmp_path: Path, suffix: str) -> None:
         np.testing.assert_array_equal(found >> 8 if found.dtype != values.dtype else found, values, err_msg=name)
 
 
+def write_copc(path: Path, points: np.ndarray) -> np.ndarray:
+    """Points (n, 3) of a square of 17 units from the origin on, to a thousandth, by another program's writer.
+
+    A hundred lie in the root of the tree, the others in its four children; the points as they stand in the file.
+    """
+    copc = pytest.importorskip("copclib")
+    file = copc.FileWriter(str(path), copc.CopcConfigWriter(6, copc.Vector3(*[1e-3] * 3)))
+    header, info = file.copc_config.las_header, file.copc_config.copc_info
+    points = np.rint(points / 1e-3) * 1e-3
+    header.min, header.max = copc.Vector3(*points.min(0)), copc.Vector3(*points.max(0))
+    info.center_x = info.center_y = info.center_z = info.halfsize = 8.5
+    info.spacing = 1
+    x, y = (points[:, :2] > 8.5).astype(int).T
+    child = np.where(np.arange(len(points)) < 100, 0, 1 + x + 2 * y)
+    for number, key in enumerate(((0, 0, 0, 0), (1, 0, 0, 0), (1, 1, 0, 0), (1, 0, 1, 0), (1, 1, 1, 0))):
+        node = copc.Points(header)
+        for place in points[child == number]:
+            point = node.CreatePoint()
+            point.x, point.y, point.z = place
+            node.AddPoint(point)
+        file.AddNode(copc.VoxelKey(*key), node)
+    file.Close()
+    return points[np.argsort(child, kind="stable")]
+
+
+def test_slices_of_copc_are_its_points_chunk_by_chunk(tmp_path: Path) -> None:
+    needed("laz")
+    path = tmp_path / "a.copc.laz"
+    points = write_copc(path, np.random.default_rng(0).uniform(0, 17, (300, 3)))
+    slices = [part.points for part in point_slices(path, rows=70)]
+    assert [len(part) for part in slices] == [70] * 4 + [20]
+    np.testing.assert_array_equal(np.concatenate(slices), points)
+    np.testing.assert_array_equal(read_cloud(path).points, points)
+
+
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_parts_are_the_file(tmp_path: Path, suffix: str) -> None:
     needed(suffix)
