@@ -87,7 +87,7 @@ class Surface(nn.Module):
         relaxation: steps of even spacing; 0: none
         refinements: projections after the even spacing; one more is nearer to the surface and a little less even
         reject: share of points made too many; the worst of their surroundings by expected error are dropped
-        slide: share of their way along the surface that points make in a refinement; less than all leaves points at tips
+        slide: share of their way along the surface that points make in a refinement; a small one leaves points at tips
             and creases, from where the network draws them, and is a little less near to the surface
         queries: seeds of a crop, in training
         smoothing: share of the crops in training whose inner points are themselves projected first, as those of a noisy
