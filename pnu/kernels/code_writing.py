@@ -63,14 +63,11 @@ def _object_file(kernels: Mapping[str, tuple[str, Any]]) -> bytes:
         if found != [NAMES[word] for word in word_types(signature)]:
             raise TypeError(f"{name}: takes {found}")
         code.name, code.linkage = name, "external"
-        whole.link_in(module)
+        whole.link_in(module)  # the kernel and what it calls; no wrappers, which may be left out
         machine = compiled.library.codegen._tm
     for value in [*whole.functions, *whole.global_variables]:
         if not value.is_declaration and value.name not in kernels:
             value.linkage = "internal"
-    passes = binding.create_new_module_pass_manager()
-    passes.add_global_dead_code_eliminate_pass()
-    passes.run(whole, binding.create_pass_builder(machine, binding.create_pipeline_tuning_options()))
     outside = {f.name for f in whole.functions if f.is_declaration and not f.name.startswith("llvm.")}
     outside |= {value.name for value in whole.global_variables if value.is_declaration}
     if not outside <= ALLOWED:
