@@ -218,8 +218,10 @@ def choices_of(compose: Callable[..., Any]) -> list[str]:
 
 def check_keys(overrides: list[str], schema: type, compose: Callable[..., Any]) -> None:
     """Refuse overrides of keys that do not exist, naming the nearest one that does."""
-    choices = choices_of(compose)
     parsed = parse(overrides)
+    if not any(override.is_delete() or _may_be_wrong(override.key_or_group, schema) for override in parsed):
+        return  # as in most commands; composing to find that out takes a tenth of a second
+    choices = choices_of(compose)
     own = [override for override in parsed if override.key_or_group not in choices]
     for override in parsed:
         key = override.key_or_group
@@ -232,6 +234,11 @@ def check_keys(overrides: list[str], schema: type, compose: Callable[..., Any]) 
     before = compose([raw for raw, override in zip(overrides, parsed, strict=True) if not override.is_delete()])
     for override in own:
         check_key(override.key_or_group, before, schema, choices)
+
+
+def _may_be_wrong(key: str, schema: type) -> bool:
+    """Whether a key is not simply one of the command's own, and no group."""
+    return key not in fields(schema) or (config_folder() / key).is_dir()
 
 
 def check_key(key: str, cfg: Any, schema: type, choices: Sequence[str]) -> None:

@@ -6,7 +6,8 @@ missing, `PNU_FAST=0` is set, or the kernels are not compiled yet (`pnu.kernels.
 | file | what |
 |---|---|
 | `compilation` | where compiled code is kept, and how it comes there |
-| `vectors`, `tiles` | several float32 at once, and matrix products made of them |
+| `code_writing`, `code_loading` | machine code that is kept, and called without numba |
+| `vectors`, `tiles`, `panels` | several float32 at once, matrix products made of them, and how matrices lie for them |
 | `boxes` | a cloud in the order of a tree of boxes, on which the next two search |
 | `neighbors`, `greedy_sampling` | the k nearest points, and farthest point sampling |
 | `dipoles` | winding numbers and fields, from which orientation comes |

@@ -42,15 +42,22 @@ def _split(place: Floats, order: Ints, first: int, stop: int, cut: int, axis: in
             break
 
 
-@kernel("int64[::1](float64[:, ::1], int64)", exact=True)
 def box_order(points: Floats, leaf: int) -> Ints:
     """An order of points (n, 3) whose every run of 2^i leaves, of `leaf` points each, fills a box of its own: (n,).
 
     Boxes are halved along their longest side; the first half gets the greatest power of two of leaves that leaves some
     for the second. So leaf l belongs to node l // 2^i of level i.
     """
+    order = np.arange(len(points), dtype=np.int64)
+    _put_in_order(points, leaf, order)
+    return order
+
+
+@kernel("void(float64[:, ::1], int64, int64[::1])", exact=True)
+def _put_in_order(points: Floats, leaf: int, order: Ints) -> None:
+    """See `box_order`."""
     n = len(points)
-    place, order = points.copy(), np.arange(n)
+    place = points.copy()
     waiting = np.empty((128, 2), np.int64)
     waiting[0, 0], waiting[0, 1] = 0, n
     depth = 1
@@ -75,4 +82,3 @@ def box_order(points: Floats, leaf: int) -> Ints:
         waiting[depth, 0], waiting[depth, 1] = first, cut
         waiting[depth + 1, 0], waiting[depth + 1, 1] = cut, stop
         depth += 2
-    return order

@@ -1,5 +1,8 @@
 """Where compiled kernels are kept, and how they come there. This file loads no numba until something is compiled.
 
+They are kept twice: as numba's own files, whose loading takes a second with numba, and as one file of machine code that
+is loaded without it (`code_loading`). A process takes the second where it is there and whole, and otherwise the first.
+
 Compiled code lies in a folder whose name tells sources, versions and processor apart, so what is found fits. It is made
 once: by `pnu doctor --install` (so by `make setup`), or in the background by a process of low priority, which the first
 long computation starts. Where no folder can be written nothing is compiled, and that is no error.
@@ -19,14 +22,18 @@ from collections.abc import Callable
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pnu.kernels.code_loading import MachineCode
 
 HERE = Path(__file__).parent
 KERNELS = ("boxes", "neighbors", "greedy_sampling", "frames", "projector", "dipoles", "planes", "pushes")
-COMPLETE, LOCK, FAILED = "complete", "lock", "failed"
+COMPLETE, LOCK, FAILED, CODE = "complete", "lock", "failed", "code"
 OLD = 30 * 86400  # seconds
 EXACT = {"nnan", "ninf", "nsz"}  # results have the bits of NumPy's operations in the order written
 LOOSE = {"nnan", "ninf", "nsz", "arcp", "contract", "reassoc"}  # to rounding
+_made: dict[str, tuple[str, Any]] = {}  # by numba in this process: signatures and functions by the names of kernels
 
 
 def kernel(*signature: str, exact: bool = False, inner: bool = False) -> Callable[[Any], Any]:
@@ -35,6 +42,9 @@ def kernel(*signature: str, exact: bool = False, inner: bool = False) -> Callabl
     signature: of the types it takes; without one it is compiled with what calls it. exact: additions and products as
     they are written; otherwise they may be fused and reordered. inner: becomes part of what calls it.
     """
+    code = machine_code()
+    if code is not None:
+        return lambda function: function if inner else code.kernel(_name(function), signature[0], function)
     from numba import config, njit
 
     flags = EXACT if exact else LOOSE
@@ -45,11 +55,32 @@ def kernel(*signature: str, exact: bool = False, inner: bool = False) -> Callabl
         before = config.CACHE_DIR
         config.CACHE_DIR = str(place or "")
         try:
-            return njit(*signature, cache=place is not None and not inner, **options)(function)
+            made = njit(*signature, cache=place is not None and not inner, **options)(function)
         finally:
             config.CACHE_DIR = before
+        if not inner:
+            _made[_name(function)] = signature[0], made
+        return made
 
     return decorate
+
+
+def _name(function: Callable[..., Any]) -> str:
+    return f"{function.__module__.rpartition('.')[2]}.{function.__name__}"
+
+
+@cache  # the same for all files of kernels in a process
+def machine_code() -> "MachineCode | None":
+    """What is kept for processes without numba; None where there is none, so that numba makes the kernels."""
+    from pnu.kernels.code_loading import load_code
+
+    place = folder()
+    return load_code(place / CODE) if place is not None and _complete(place) else None
+
+
+def by_numba() -> bool:
+    """Whether numba makes the kernels of this process, so that what they are written with is needed."""
+    return machine_code() is None
 
 
 @cache
@@ -89,12 +120,21 @@ def compile_all(*, wait: bool = True) -> bool:
             if not complete():
                 for name in KERNELS:
                     importlib.import_module(f"pnu.kernels.{name}")
+                _keep_code(place)
                 (place / COMPLETE).touch()
                 _forget_old(place)
     except Exception as error:  # a compiler can fail in many ways, and nobody needs it
         _note(place, error)
         return False
     return True
+
+
+def _keep_code(place: Path) -> None:
+    """Machine code beside numba's files; where that cannot be, processes start a second later."""
+    from pnu.kernels import code_writing
+
+    with contextlib.suppress(Exception):
+        code_writing.write_code(place / CODE, _made)
 
 
 def reason() -> str | None:

@@ -9,8 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnu.kernels.boxes import Floats, Ints
-from pnu.kernels.compilation import kernel
-from pnu.kernels.vectors import LANES, full, fused, largest, load_vector, root, store_vector, where
+from pnu.kernels.compilation import by_numba, kernel
+from pnu.kernels.panels import LANES
+
+if by_numba():  # kept machine code has them inside
+    from pnu.kernels.vectors import full, fused, largest, load_vector, root, store_vector, where
 
 Buffer = NDArray[np.float32]
 f32 = np.float32

@@ -21,7 +21,9 @@ OUTSIDE = f32(1e18)  # corners of empty boxes; its square is finite
 def farthest_first(points: NDArray[np.float32], m: int, start: int) -> Ints:
     """From `start` on always the point farthest from all chosen before: points (n, 3) -> (m,) indices, m <= n."""
     points = np.require(points, np.float32, ["C", "W", "A"])
-    return np.asarray(_choose(points, box_order(points.astype(np.float64), LEAF), m, start))
+    chosen = np.empty(m, np.int64)
+    _choose(points, box_order(points.astype(np.float64), LEAF), start, chosen)
+    return chosen
 
 
 @kernel(exact=True, inner=True)
@@ -61,8 +63,8 @@ def _join(best: Singles, best_id: Ints, node: int) -> None:
     best[node], best_id[node] = best[left], best_id[left]
 
 
-@kernel("int64[::1](float32[:, ::1], int64[::1], int64, int64)", exact=True)
-def _choose(points: Singles, order: Ints, m: int, start: int) -> Ints:
+@kernel("void(float32[:, ::1], int64[::1], int64, int64[::1])", exact=True)
+def _choose(points: Singles, order: Ints, start: int, chosen: Ints) -> None:
     """See `farthest_first`; order: of boxes, in leaves of LEAF points."""
     n = len(points)
     filled = (n + LEAF - 1) // LEAF
@@ -76,7 +78,12 @@ def _choose(points: Singles, order: Ints, m: int, start: int) -> Ints:
     box[:, :3], box[:, 3:] = OUTSIDE, -OUTSIDE
     for leaf in range(filled):
         first, stop = leaf * LEAF, min(leaf * LEAF + LEAF, n)
-        ids[first:stop] = np.sort(order[first:stop])
+        for i in range(first, stop):
+            at = i
+            while at > first and ids[at - 1] > order[i]:
+                ids[at] = ids[at - 1]
+                at -= 1
+            ids[at] = order[i]
         corners = box[leaves + leaf]
         for i in range(first, stop):
             position[ids[i]], dist[i] = i, UNKNOWN
@@ -90,9 +97,9 @@ def _choose(points: Singles, order: Ints, m: int, start: int) -> Ints:
             box[node, axis] = min(box[2 * node, axis], box[2 * node + 1, axis])
             box[node, 3 + axis] = max(box[2 * node, 3 + axis], box[2 * node + 1, 3 + axis])
         _join(best, best_id, node)
-    chosen, passed, waiting = np.empty(m, np.int64), np.empty(2 * leaves, np.int64), np.empty(128, np.int64)
+    passed, waiting = np.empty(2 * leaves, np.int64), np.empty(128, np.int64)
     current = start
-    for step in range(m):
+    for step in range(len(chosen)):
         chosen[step] = current
         at = position[current]
         x, y, z = axes[0, at], axes[1, at], axes[2, at]
@@ -121,4 +128,3 @@ def _choose(points: Singles, order: Ints, m: int, start: int) -> Ints:
             _join(best, best_id, node)
             node //= 2
         current = best_id[1]
-    return chosen

@@ -21,9 +21,18 @@ class NeighborTree:
     """A cloud (n, 3), n >= 1, made ready for searches."""
 
     def __init__(self, points: NDArray[np.floating]) -> None:
-        points = np.require(points, np.float64, ["C", "W", "A"])
-        self.order = box_order(points, LEAF)  # of the points, in which neighbors come soon after each other
-        self.parts = _tree(points, self.order)
+        places: Floats = np.require(points, np.float64, ["C", "W", "A"])
+        self.order = box_order(places, LEAF)  # of the points, in which neighbors come soon after each other
+        leaves = -(-len(places) // LEAF)
+        levels, nodes = [0], leaves
+        while nodes > 1 or len(levels) == 1:
+            nodes = -(-nodes // CHILDREN)
+            levels.append(levels[-1] + nodes)
+        axes, ids = np.full((3, leaves * LEAF), NOWHERE), np.zeros(leaves * LEAF, np.int64)
+        boxes = np.empty((levels[-1], 6, CHILDREN))
+        boxes[:, :3], boxes[:, 3:] = NOWHERE, -NOWHERE
+        self.parts = axes, ids, boxes, np.array(levels, np.int64)
+        _fill_tree(places, self.order, *self.parts)
 
     def search(self, queries: NDArray[np.floating], k: int) -> tuple[Ints, Floats]:
         """The k <= n nearest points of each query (m, 3): `idx[i, j]` is the j-th nearest of query i, and their squared
@@ -34,27 +43,15 @@ class NeighborTree:
         return idx, dist_sq
 
 
-@kernel("Tuple((float64[:, ::1], int64[::1], float64[:, :, ::1], int64[::1]))(float64[:, ::1], int64[::1])", exact=True)
-def _tree(points: Floats, order: Ints) -> tuple[Floats, Ints, Floats, Ints]:
+@kernel("void(float64[:, ::1], int64[::1], float64[:, ::1], int64[::1], float64[:, :, ::1], int64[::1])", exact=True)
+def _fill_tree(points: Floats, order: Ints, axes: Floats, ids: Ints, boxes: Floats, levels: Ints) -> None:
     """Coordinates (3, leaves x LEAF) in order; their indices; children's boxes (groups, 6, CHILDREN), low and high
     corners; the first group of each level, that of leaves first, and the end."""
     n = len(points)
-    leaves = (n + LEAF - 1) // LEAF
-    axes, ids = np.full((3, leaves * LEAF), NOWHERE), np.zeros(leaves * LEAF, np.int64)
     for i in range(n):
         ids[i] = order[i]
         for axis in range(3):
             axes[axis, i] = points[order[i], axis]
-    levels = np.zeros(24, np.int64)
-    depth, nodes = 0, leaves
-    while True:
-        nodes = (nodes + CHILDREN - 1) // CHILDREN
-        levels[depth + 1] = levels[depth] + nodes
-        depth += 1
-        if nodes == 1:
-            break
-    boxes = np.empty((levels[depth], 6, CHILDREN))
-    boxes[:, :3], boxes[:, 3:] = NOWHERE, -NOWHERE
     for i in range(n):
         leaf = i // LEAF
         box = boxes[leaf // CHILDREN]
@@ -62,13 +59,14 @@ def _tree(points: Floats, order: Ints) -> tuple[Floats, Ints, Floats, Ints]:
         for axis in range(3):
             box[axis, child] = min(box[axis, child], axes[axis, i])
             box[3 + axis, child] = max(box[3 + axis, child], axes[axis, i])
-    for level in range(1, depth):
+    for level in range(1, len(levels) - 1):
         for group in range(levels[level] - levels[level - 1]):
             box, below = boxes[levels[level] + group // CHILDREN], boxes[levels[level - 1] + group]
             for axis in range(3):
-                box[axis, group % CHILDREN] = below[axis].min()
-                box[3 + axis, group % CHILDREN] = below[3 + axis].max()
-    return axes, ids, boxes, levels[: depth + 1].copy()
+                for child in range(CHILDREN):
+                    low, high = below[axis, child], below[3 + axis, child]
+                    box[axis, group % CHILDREN] = min(box[axis, group % CHILDREN], low)
+                    box[3 + axis, group % CHILDREN] = max(box[3 + axis, group % CHILDREN], high)
 
 
 @kernel(exact=True, inner=True)
@@ -101,6 +99,32 @@ def _keep_nearest(dist: Floats, ids: Ints, count: int, k: int) -> None:
             low = i
         else:
             break
+
+
+@kernel(exact=True, inner=True)
+def _smallest(values: Floats, count: int, k: int) -> float:
+    """The k-th smallest of `count` values, which it moves (Hoare's selection)."""
+    low, high = 0, count - 1
+    cut = k - 1
+    while low < high:
+        pivot = values[(low + high) // 2]
+        i, j = low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if cut <= j:
+            high = j
+        elif cut >= i:
+            low = i
+        else:
+            break
+    return values[cut]
 
 
 @kernel(exact=True, inner=True)
@@ -137,7 +161,7 @@ def _enough(
     for i in range(first, stop):
         dx, dy, dz = axes[0, i] - x, axes[1, i] - y, axes[2, i] - z
         dist[i - first] = dx * dx + dy * dy + dz * dz
-    return np.partition(dist[: stop - first], k - 1)[k - 1]
+    return _smallest(dist, stop - first, k)
 
 
 @kernel(exact=True, inner=True)
@@ -175,7 +199,9 @@ def _within(
                 count += near <= limit
             if count + LEAF > len(found):
                 _keep_nearest(dist, found, count, k)
-                count, limit = k, dist[:k].max()
+                count, limit = k, dist[0]
+                for i in range(1, k):
+                    limit = max(limit, dist[i])
                 if limit == 0:  # no other can be nearer
                     return k if begun == 0 else -1
     return count

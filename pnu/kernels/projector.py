@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnu.kernels.boxes import Floats, Ints
-from pnu.kernels.compilation import kernel
+from pnu.kernels.compilation import by_numba, kernel
 from pnu.kernels.frames import (
     FEATURES,
     FRAME,
@@ -28,18 +28,21 @@ from pnu.kernels.frames import (
     gather_block,
     make_frames,
 )
-from pnu.kernels.tiles import FEW_ROWS, PANEL, ROWS, VECTORS, pack, padded, tile
-from pnu.kernels.vectors import LANES, full, fused, largest, load_vector, power_of_two, store_vector, sum_of_lanes
+from pnu.kernels.panels import LANES, PANEL, VECTORS, pack, padded
+
+if by_numba():  # kept machine code has them inside
+    from pnu.kernels.tiles import FEW_ROWS, ROWS, tile
+    from pnu.kernels.vectors import full, fused, largest, load_vector, power_of_two, store_vector, sum_of_lanes
+
+    _first = tile(FEW_ROWS, VECTORS, relu=True)
+    _layer, _logits = tile(ROWS, VECTORS, relu=True), tile(ROWS, VECTORS, relu=False)
+    _head, _context = tile(FEW_ROWS, VECTORS, relu=True), tile(FEW_ROWS, VECTORS, relu=False)
+    _out = tile(FEW_ROWS, 1, relu=False)
 
 OUT = 7  # numbers: position, normal, logarithm of the error
 BENT = 7  # of the features: the bent plane, chosen beside 3:6, the normal
 LOG2_E = f32(np.log2(np.e))
 NOTHING = f32(-1e30)
-
-_first = tile(FEW_ROWS, VECTORS, relu=True)
-_layer, _logits = tile(ROWS, VECTORS, relu=True), tile(ROWS, VECTORS, relu=False)
-_head, _context = tile(FEW_ROWS, VECTORS, relu=True), tile(FEW_ROWS, VECTORS, relu=False)
-_out = tile(FEW_ROWS, 1, relu=False)
 
 
 class PackedWeights(NamedTuple):
@@ -187,7 +190,10 @@ def project_queries(
     normals, and the logarithm of the expected error."""
     k, wide = idx.shape[1], len(first_bias)
     rows = (k + ROWS - 1) // ROWS * ROWS  # of a query
-    scale = LOG2_E if np.any(attention != 0) else f32(0)
+    scale = f32(0)
+    for weight in attention:
+        if weight != 0:
+            scale = LOG2_E
     near, hint, work = np.empty(k * NEAR * LANES, f32), np.empty(3 * LANES, f32), np.empty(k * WORK * LANES, f32)
     features, frame = np.empty(k * FEATURES * LANES, f32), np.empty(FRAME * LANES, f32)
     below, middle = np.zeros(LANES * rows * wide, f32), np.empty(LANES * rows * wide, f32)
@@ -240,7 +246,8 @@ def project_queries(
             for c in range(0, wide, LANES):
                 store_vector(seen, q * seen_wide + 2 * wide + c, load_vector(contexts, q * wide + c))
             _chosen(above, q * rows * wide, choices, k, wide, shares)
-            chosen[q] = shares
+            for i in range(len(shares)):
+                chosen[q, i] = shares[i]
         for p in range(0, 2 * wide, PANEL):
             for q in range(0, LANES, FEW_ROWS):
                 _head(

@@ -1,37 +1,22 @@
 """Matrix products in tiles whose sums stay in registers, with bias and ReLU: what the layers of a network are made of.
 
-The right matrix is packed: panels of PANEL columns, one after another, each row by row. A tile has ROWS rows and PANEL
-columns, which leaves registers for a row of the panel and a number of the left matrix.
+The right matrix is packed (`panels`). A tile has ROWS rows and PANEL columns, which leaves registers for a row of the
+panel and a number of the left matrix.
 """
 
 from typing import Any
 
-import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
-from numpy.typing import NDArray
 
-from pnu.kernels.vectors import LANES, VECTOR, call, constant, greater, load_at, pointer, spread, store_at
+from pnu.kernels.panels import LANES
+from pnu.kernels.vectors import VECTOR, call, constant, greater, load_at, pointer, spread, store_at
 
-VECTORS = 4 if LANES == 16 else 2  # beside each other: 32 registers, or 16
 ROWS = 6
 FEW_ROWS = 4
-PANEL = VECTORS * LANES
 WORD = ir.IntType(64)
-
-
-def padded(width: int) -> int:
-    """Columns that as many fill up to whole panels."""
-    return -(-width // PANEL) * PANEL
-
-
-def pack(matrix: NDArray[np.float32], columns: int = PANEL) -> NDArray[np.float32]:
-    """A matrix (depth, width) as flat panels; its width is a multiple of `columns`."""
-    depth, width = matrix.shape
-    panels = matrix.reshape(depth, width // columns, columns).transpose(1, 0, 2)
-    return np.ascontiguousarray(panels, np.float32).ravel()
 
 
 def tile(rows: int, vectors: int, *, relu: bool) -> Any:

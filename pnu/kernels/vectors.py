@@ -6,23 +6,17 @@ floats.
 """
 
 import operator
-import os
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from llvmlite import binding, ir
+from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
 
+from pnu.kernels.panels import LANES
 
-def _lanes() -> int:
-    features = binding.get_host_cpu_features()
-    return int(os.environ.get("PNU_LANES") or (16 if features.get("avx512f") else 8))
-
-
-LANES = _lanes()
 FLOAT, INT = ir.FloatType(), ir.IntType(32)
 VECTOR, INTEGERS = ir.VectorType(FLOAT, LANES), ir.VectorType(INT, LANES)
 FLAGS = ("nnan", "ninf", "nsz", "arcp", "contract")

@@ -62,11 +62,13 @@ def steps(total: int, quiet: bool) -> Iterator[Callable[[str], None]]:
 def stages(quiet: bool) -> Iterator[Progress]:
     """A bar for each stage, with the time left, from its first step on: an error that comes first stands alone."""
     tasks: dict[str, Any] = {}
-    shown = bar(quiet=quiet)
+    shown = None if quiet else bar()
 
     def progress(stage: str, done: int, total: int) -> None:
         for listener in listeners:
             listener(stage, done, total)
+        if shown is None:
+            return
         known = total if total > 1 or done else None  # a single step has no middle to show
         if stage not in tasks:
             shown.start()
@@ -76,7 +78,7 @@ def stages(quiet: bool) -> Iterator[Progress]:
     try:
         yield progress
     finally:
-        if tasks:
+        if shown is not None and tasks:
             shown.stop()
 
 

@@ -24,6 +24,7 @@ def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setattr(compilation, "folder", lambda: tmp_path / "kernels-new")
     monkeypatch.setattr("pnu.commands.doctor.folder", compilation.folder)
     monkeypatch.setattr(compilation, *KERNEL)
+    monkeypatch.setattr("pnu.kernels.code_writing.write_code", lambda path, kernels: path.touch())
     yield tmp_path / "kernels-new"
     compilation._start.cache_clear()
 
