@@ -221,30 +221,6 @@ def test_every_point_given_has_one_within_half_a_spacing(shape: str, ratio: floa
     assert share.max() < 0.7
 
 
-@pytest.mark.slow
-def test_noisy_creases_keep_their_points() -> None:
-    """Gaps along creases are smaller than where refinements move points as far as the network says."""
-    gaps: dict[str, list[float]] = {"ships": [], "slides": []}
-    for shape, seed in (("mug", 0), ("bracket", 0), ("mug", 1), ("bracket", 1)):
-        mesh, rng = shapes.make(shape), np.random.default_rng(seed)
-        points = sample_area(mesh, 1500, rng)[:, :3] + 0.01 * rng.standard_normal((1500, 3))
-        for kind, changed in (("ships", {}), ("slides", {"slide": 1.0, "reject": 0.003})):
-            network = pnu.load("surface_noisy")
-            vars(network).update(changed)
-            dense = pnu.upsample(points, model=network, keep=False)
-            gaps[kind].append(float(np.quantile(cKDTree(dense[:, :3]).query(along_creases(mesh))[0], 0.95)))
-    assert np.mean(gaps["ships"]) < 0.97 * np.mean(gaps["slides"])
-
-
-def along_creases(mesh: Any) -> Array:
-    """Points of the edges where two faces meet at 35 degrees and more, (n, 3)."""
-    solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
-    ends = solid.vertices[solid.face_adjacency_edges[solid.face_adjacency_angles > np.radians(35)]]
-    share = np.linspace(0, 1, 20)[:, None]
-    found: Array = (ends[:, None, 0] * share + ends[:, None, 1] * (1 - share)).reshape(-1, 3)
-    return found
-
-
 @pytest.mark.parametrize(("axis", "noise"), [(1.0, 0.02), (0.4, 0.01)])
 def test_noise_shrinks_nothing(axis: float, noise: float) -> None:
     """A sphere, and an ellipsoid with tips: mean distance from the true surface, inside or outside, in noises."""
