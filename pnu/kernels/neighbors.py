@@ -102,29 +102,11 @@ def _keep_nearest(dist: Floats, ids: Ints, count: int, k: int) -> None:
 
 
 @kernel(exact=True, inner=True)
-def _smallest(values: Floats, count: int, k: int) -> float:
-    """The k-th smallest of `count` values, which it moves (Hoare's selection)."""
-    low, high = 0, count - 1
-    cut = k - 1
-    while low < high:
-        pivot = values[(low + high) // 2]
-        i, j = low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while pivot < values[j]:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if cut <= j:
-            high = j
-        elif cut >= i:
-            low = i
-        else:
-            break
-    return values[cut]
+def _farthest(dist: Floats, k: int) -> float:
+    limit = dist[0]
+    for i in range(1, k):
+        limit = max(limit, dist[i])
+    return limit
 
 
 @kernel(exact=True, inner=True)
@@ -139,7 +121,17 @@ def _to_boxes(x: float, y: float, z: float, box: Floats, far: Floats) -> None:
 
 @kernel(exact=True, inner=True)
 def _enough(
-    x: float, y: float, z: float, k: int, n: int, axes: Floats, boxes: Floats, levels: Ints, far: Floats, dist: Floats
+    x: float,
+    y: float,
+    z: float,
+    k: int,
+    n: int,
+    axes: Floats,
+    boxes: Floats,
+    levels: Ints,
+    far: Floats,
+    dist: Floats,
+    found: Ints,
 ) -> float:
     """A squared radius in which there are k points: those of the smallest node near the place that has so many."""
     level, group, size = len(levels) - 2, 0, LEAF * CHILDREN ** (len(levels) - 1)
@@ -161,7 +153,9 @@ def _enough(
     for i in range(first, stop):
         dx, dy, dz = axes[0, i] - x, axes[1, i] - y, axes[2, i] - z
         dist[i - first] = dx * dx + dy * dy + dz * dz
-    return _smallest(dist, stop - first, k)
+        found[i - first] = i
+    _keep_nearest(dist, found, stop - first, k)
+    return _farthest(dist, k)
 
 
 @kernel(exact=True, inner=True)
@@ -199,9 +193,7 @@ def _within(
                 count += near <= limit
             if count + LEAF > len(found):
                 _keep_nearest(dist, found, count, k)
-                count, limit = k, dist[0]
-                for i in range(1, k):
-                    limit = max(limit, dist[i])
+                count, limit = k, _farthest(dist, k)
                 if limit == 0:  # no other can be nearer
                     return k if begun == 0 else -1
     return count
@@ -222,6 +214,7 @@ def _search(
     room = ROOM * k + 4 * LEAF * CHILDREN
     dist, found, sorted_ = np.empty(room), np.empty(room, np.int64), np.empty(room, np.int64)
     nearby = np.empty(max(room, CHILDREN * k + LEAF * CHILDREN))
+    nearby_ids = np.empty(len(nearby), np.int64)
     far, stack = np.empty(CHILDREN), np.empty((24 * CHILDREN, 2), np.int64)
     limit, grow = -1.0, 1 + MORE / np.sqrt(k)
     for q in range(len(queries)):
@@ -230,7 +223,7 @@ def _search(
         if limit >= 0:
             count = _within(x, y, z, limit * grow, k, axes, ids, boxes, levels, far, stack, dist, found)
         if 0 <= count < k:
-            limit = _enough(x, y, z, k, n, axes, boxes, levels, far, nearby)
+            limit = _enough(x, y, z, k, n, axes, boxes, levels, far, nearby, nearby_ids)
             count = _within(x, y, z, limit, k, axes, ids, boxes, levels, far, stack, dist, found)
         if count < 0:
             count = _within(x, y, z, 0.0, k, axes, ids, boxes, levels, far, stack, dist, found)
