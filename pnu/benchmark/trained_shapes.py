@@ -77,7 +77,11 @@ def of_data(data: Mapping[str, Any]) -> Trained:
     """From a run's group `data`."""
     kept = frozenset(str(name) for name in data.get("validation") or ())
     procedural: frozenset[str] = frozenset()
-    if data.get("procedural"):  # data=surface: all but those of validation
+    mixed = data.get("procedural")
+    beside = (
+        [f"{shapes.BESIDE_MESHES}{name}" for name in shapes.names(*mixed)] if isinstance(mixed, list) and mixed else []
+    )
+    if mixed is True:  # data=surface: all but those of validation
         procedural = frozenset(shapes.names())
     elif data.get("kinds"):
         procedural = frozenset(procedural_part(data, "train"))
@@ -86,7 +90,11 @@ def of_data(data: Mapping[str, Any]) -> Trained:
         try:
             names = list(meshes_of(data["root"]))
             whole = "validation" in data  # keeps the meshes that are named, no share of them
-            meshes = frozenset(names if whole else chosen_names(names, data, "train", None))
+            chosen = names if whole else chosen_names([*names, *beside], data, "train", None)
+            meshes = frozenset(name for name in chosen if not name.startswith(shapes.BESIDE_MESHES))
+            procedural |= {
+                name.removeprefix(shapes.BESIDE_MESHES) for name in chosen if name.startswith(shapes.BESIDE_MESHES)
+            }
         except ValueError:
             unknown = f"its meshes in {data['root']} are not here"
     elif data.get("path"):

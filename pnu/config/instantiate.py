@@ -13,7 +13,7 @@ PACKAGES = {  # which may define the classes of a group; `allow` adds to them
     "optimizer": ("torch.optim",),
     "scheduler": ("torch.optim.lr_scheduler",),
     "trainer": ("lightning.pytorch",),
-    "callbacks": ("pnu.training.callbacks", "lightning.pytorch.callbacks"),
+    "callbacks": ("pnu.training.callbacks", "pnu.training.captured_step", "lightning.pytorch.callbacks"),
     "logger": ("lightning.pytorch.loggers",),
 }
 RENAMED = {"pnu.models.": "pnu.networks."}  # in the configs of older runs and weights

@@ -1,4 +1,4 @@
-"""Augmentation of one training sample on the fly, as the paper and its released code have it."""
+"""Augmentation of training samples on the fly, as the paper and its released code have it."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnu.geometry.transforms import rotate, rotation_matrix, scale, small_rotation, translate
+from pnu.geometry.transforms import rotate, rotation_matrix, small_rotation
 
 
 class Augmentation:
@@ -53,29 +53,34 @@ class Augmentation:
         self.input_probability = input_probability
 
     def __call__(self, clouds: Mapping[str, Tensor], generator: torch.Generator) -> dict[str, Tensor]:
-        """Clouds (1, n, 3 or 6) by name, "input" among them; all others are targets. The same keys, changed."""
+        """Clouds (B, n, 3 or 6) by name, "input" among them; all others are targets. The same keys, changed, each
+        sample in its own way. The generator is of the clouds' device."""
         # every number is drawn whatever the switches are, so that one switch does not change the other parts
-        rotation = rotation_matrix(1, generator=generator)
+        samples, device = len(clouds["input"]), generator.device
+        rotation = rotation_matrix(samples, generator=generator)
         low, high = self.scale
-        factor = low + (high - low) * torch.rand(1, generator=generator)
-        offset = self.shift * (2 * torch.rand(1, 3, generator=generator) - 1)
+        factor = low + (high - low) * torch.rand(samples, 1, 1, generator=generator, device=device)
+        offset = self.shift * (2 * torch.rand(samples, 1, 3, generator=generator, device=device) - 1)
         changed = {}
         for name, cloud in clouds.items():
+            points, *normals = torch.split(cloud, 3, dim=-1)
             if self.rotation:
-                cloud = rotate(cloud, rotation)
-            changed[name] = translate(scale(cloud, factor), offset)
+                points, *normals = (part @ rotation.transpose(-1, -2) for part in (points, *normals))
+            changed[name] = torch.cat([points * factor + offset, *normals], -1)
         changed["input"] = self.disturb(changed["input"], generator)
         return changed
 
     def disturb(self, cloud: Tensor, generator: torch.Generator) -> Tensor:
         """Jitter and a small rotation about the origin, of the input alone."""
-        jittered, tilted = (torch.rand(2, generator=generator) < self.input_probability).tolist()
-        noise = torch.randn(cloud.shape[1], 3, generator=generator) * self.jitter_sigma
-        tilt = small_rotation(1, self.tilt_sigma, self.tilt_clip, generator=generator)
-        if jittered:
+        samples, points, _ = cloud.shape
+        drawn = torch.rand(samples, 2, 1, 1, generator=generator, device=generator.device) < self.input_probability
+        jittered, tilted = drawn.unbind(1)
+        noise = torch.randn(samples, points, 3, generator=generator, device=generator.device) * self.jitter_sigma
+        tilt = small_rotation(samples, self.tilt_sigma, self.tilt_clip, generator=generator)
+        if bool(jittered.any()):
             noise = noise.clamp(-self.jitter_clip, self.jitter_clip)
-            cloud = torch.cat([cloud[..., :3] + noise, cloud[..., 3:]], -1)
-        return rotate(cloud, tilt) if tilted else cloud
+            cloud = torch.cat([cloud[..., :3] + torch.where(jittered, noise, 0.0), cloud[..., 3:]], -1)
+        return torch.where(tilted, rotate(cloud, tilt), cloud) if bool(tilted.any()) else cloud
 
 
 def from_options(options: Augmentation | Mapping[str, Any] | None) -> Augmentation | None:

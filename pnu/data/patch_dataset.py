@@ -1,7 +1,7 @@
 """Training samples cut from a patch file, and the order in which they come."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -44,7 +44,7 @@ class PatchDataset(Dataset[dict[str, Any]]):
 
     "input" (n, 6) and "target" (m, 6) float32, in the unit sphere of the input before augmentation; "index", the row in
     the file; "shape", its name; and "edges" (e, 3) where the file has them. All that is random comes from (seed, epoch,
-    row) alone. Each process opens the file itself.
+    row) alone. Each process opens the file itself. `whole`: patches as they are, and their "epoch", for `samples`.
     """
 
     def __init__(
@@ -56,7 +56,9 @@ class PatchDataset(Dataset[dict[str, Any]]):
         seed: int,
         augmentation: Augmentation | None = None,
         names: Sequence[str] | None = None,
+        whole: bool = False,
     ) -> None:
+        self.whole = whole
         self.path, self.rows, self.options, self.seed = Path(path), list(rows), options, seed
         self.augmentation, self.names = augmentation, names
         self.opened: tuple[int, dict[str, h5py.Dataset]] | None = None
@@ -84,47 +86,63 @@ class PatchDataset(Dataset[dict[str, Any]]):
     def __getitem__(self, key: int | tuple[int, int]) -> dict[str, Any]:
         epoch, i = key if isinstance(key, tuple) else (0, key)
         row = self.rows[i]
-        generator = sample_generator(self.seed, epoch, row)
-        target = self.read("poisson_4096", row)
-        if self.options.target_points < target.shape[1]:
-            target = neighborhood(target, self.options.target_points, generator)
-        clouds = {"input": self.downsampled(target, row, generator), "target": target}
+        patch = {"target": self.read("poisson_4096", row)}
+        if self.options.downsampling == "given":
+            patch["input"] = self.read("montecarlo_1024", row)
         if "edges" in self.file():
-            clouds["edges"] = self.read("edges", row)
-        frame = unit_sphere_frame(clouds["input"])
-        clouds = {name: frame.to_unit(cloud) for name, cloud in clouds.items()}
-        if self.augmentation is not None:
-            clouds = self.augmentation(clouds, generator)
-        sample: dict[str, Any] = {name: cloud[0] for name, cloud in clouds.items()}
-        return sample | {"index": row, "shape": self.names[row] if self.names else f"patch_{row}"}
+            patch["edges"] = self.read("edges", row)
+        if not self.whole:
+            patch = samples(patch, self.options, self.augmentation, sample_generator(self.seed, epoch, row))
+        sample: dict[str, Any] = {name: cloud[0] for name, cloud in patch.items()}
+        sample |= {"index": row, "shape": self.names[row] if self.names else f"patch_{row}"}
+        return sample | ({"epoch": epoch} if self.whole else {})
 
-    def downsampled(self, target: Tensor, row: int, generator: torch.Generator) -> Tensor:
-        """The input (1, input_points, 3 or 6) of a target (1, n, 6), drawn from it or, if given, from the file's."""
-        m, kind = self.options.input_points, self.options.downsampling
-        if kind == "given":
-            given = self.read("montecarlo_1024", row)
-            return gather(given, random_points(given, m, generator=generator))
-        points = target[..., :3]
-        if kind == "nonuniform":
-            idx = nonuniform_points(
-                points, m, strength=self.options.strength, centers=self.options.centers, generator=generator
-            )
-        else:
-            idx = (random_points if kind == "random" else poisson_disk_points)(points, m, generator=generator)
-        return gather(target, idx)
+
+def samples(
+    patches: Mapping[str, Tensor], options: Options, augmentation: Augmentation | None, generator: torch.Generator
+) -> dict[str, Tensor]:
+    """Training samples of whole patches: downsampled, in the unit sphere of the input, then augmented.
+
+    Args:
+        patches: "target" (B, n, 6); "input" (B, n', 3 or 6) where it is given; "edges" (B, e, 3) or none.
+        options: how they are cut.
+        augmentation: of training samples, or None.
+        generator: of the patches' device.
+    """
+    target = patches["target"]
+    if options.target_points < target.shape[1]:
+        target = neighborhood(target, options.target_points, generator)
+    clouds = {**patches, "input": downsampled(patches.get("input"), target, options, generator), "target": target}
+    frame = unit_sphere_frame(clouds["input"])
+    clouds = {name: frame.to_unit(cloud) for name, cloud in clouds.items()}
+    return clouds if augmentation is None else augmentation(clouds, generator)
+
+
+def downsampled(given: Tensor | None, target: Tensor, options: Options, generator: torch.Generator) -> Tensor:
+    """Inputs (B, input_points, 3 or 6) of targets (B, n, 6), drawn from them or from what is given."""
+    m, kind = options.input_points, options.downsampling
+    if given is not None:
+        return gather(given, random_points(given, m, generator=generator))
+    points = target[..., :3]
+    if kind == "nonuniform":
+        idx = nonuniform_points(points, m, strength=options.strength, centers=options.centers, generator=generator)
+    else:
+        idx = (random_points if kind == "random" else poisson_disk_points)(points, m, generator=generator)
+    return gather(target, idx)
 
 
 def neighborhood(target: Tensor, m: int, generator: torch.Generator) -> Tensor:
-    """The m points of a patch (1, n, 6) nearest to a random one of them: a smaller patch of the same density."""
-    center = target[:, torch.randint(target.shape[1], (1,), generator=generator), :3]
-    distance = (target[..., :3] - center).square().sum(-1)
+    """The m points of each patch (B, n, 6) nearest to a random one of them: a smaller patch of the same density."""
+    clouds, n, _ = target.shape
+    chosen = torch.randint(n, (clouds, 1), generator=generator, device=generator.device)
+    distance = (target[..., :3] - gather(target, chosen)[..., :3]).square().sum(-1)
     return gather(target, distance.topk(m, dim=1, largest=False).indices)
 
 
-def sample_generator(seed: int, epoch: int, row: int) -> torch.Generator:
-    """A generator that depends on the three numbers alone."""
-    state = np.random.SeedSequence([seed, epoch, row]).generate_state(2, np.uint32)
-    return torch.Generator().manual_seed(int(state[0]) << 31 ^ int(state[1]))
+def sample_generator(*numbers: int, device: torch.device | str = "cpu") -> torch.Generator:
+    """A generator that depends on the numbers alone, such as seed, epoch and row."""
+    state = np.random.SeedSequence(numbers).generate_state(2, np.uint32)
+    return torch.Generator(device).manual_seed(int(state[0]) << 31 ^ int(state[1]))
 
 
 class EpochSampler(Sampler[tuple[int, int]]):

@@ -8,11 +8,21 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Subset
 
 from pnu.data import shapes
 from pnu.data.augment import Augmentation, from_options
-from pnu.data.patch_dataset import Downsampling, EpochSampler, Options, PatchDataset, check_options, split_shapes
+from pnu.data.patch_dataset import (
+    Downsampling,
+    EpochSampler,
+    Options,
+    PatchDataset,
+    check_options,
+    sample_generator,
+    samples,
+    split_shapes,
+)
 from pnu.data.patch_file import check_patch_file, cut_patch_file, told_open
 from pnu.extras import needed
 from pnu.io import Mesh, meshes_of, read_mesh
@@ -127,6 +137,7 @@ class PatchDataModule(EpochDataModule):
         strength: nonuniform: centers are exp(strength) times denser than the farthest points; 0: uniform
         centers: nonuniform: dense places of a patch
         augmentation: random changes of training samples; a part with range or sigma 0 is off; null: none at all
+        on_device: downsample and augment whole batches where they are trained on; other random numbers than one by one
         val_share: share of the shapes kept for validation
         test_share: share of the shapes kept for the test
     """
@@ -147,6 +158,7 @@ class PatchDataModule(EpochDataModule):
         strength: float = 2.0,
         centers: int = 3,
         augmentation: Augmentation | Mapping[str, Any] | None = None,
+        on_device: bool = False,
         val_share: float = 0.1,
         test_share: float = 0.1,
     ) -> None:
@@ -155,6 +167,7 @@ class PatchDataModule(EpochDataModule):
         self.options = Options(input_points, target_points, downsampling, strength, centers)
         self.evaluation = self.options._replace(downsampling=evaluation or downsampling)
         self.augmentation = from_options(augmentation)
+        self.on_device = on_device
         self.shares = {"val": val_share, "test": test_share}
         self.rows: dict[str, list[int]] | None = None
 
@@ -193,8 +206,17 @@ class PatchDataModule(EpochDataModule):
         options = self.options if part == "train" else self.evaluation
         return PatchDataset(
             self.file, self.rows[part], options, seed=self.seed if part == "train" else 0,
-            augmentation=augmentation, names=self.names,
+            augmentation=augmentation, names=self.names, whole=self.on_device and part == "train",
         )  # fmt: skip
+
+    def on_after_batch_transfer(self, batch: dict[str, Any], dataloader_idx: int) -> dict[str, Any]:
+        """The samples of whole patches (`on_device`), by a generator from the seed, the epoch and their rows."""
+        if "epoch" not in batch:
+            return batch
+        numbers = [self.seed, *batch.pop("epoch")[:1].tolist(), *batch["index"].tolist()]
+        patches: dict[str, Tensor] = {name: batch[name] for name in ("target", "input", "edges") if name in batch}
+        generator = sample_generator(*numbers, device=patches["target"].device)
+        return batch | samples(patches, self.options, self.augmentation, generator)
 
 
 class GeneratedDataModule(PatchDataModule):
@@ -278,12 +300,13 @@ class MeshDataModule(GeneratedDataModule):
 
     Args:
         root: folder of meshes: ply, off, obj, stl, glb, gltf, vtk, vtp; its subfolders count too
+        procedural: kinds of procedural shapes beside them: organic, cad
         options: as for `GeneratedDataModule` and `PatchDataModule`.
     """
 
-    def __init__(self, root: str | None = None, **options: Any) -> None:
+    def __init__(self, root: str | None = None, procedural: Iterable[str] = (), **options: Any) -> None:
         super().__init__(**options)
-        self.root = root
+        self.root, self.procedural = root, shapes.names(*procedural) if procedural else []
 
     @functools.cached_property
     def files(self) -> dict[str, Path]:
@@ -296,9 +319,13 @@ class MeshDataModule(GeneratedDataModule):
 
     def makers(self) -> dict[str, Callable[[], Mesh]]:
         """Functions that read the meshes, by name."""
-        return {name: functools.partial(read_mesh, path) for name, path in self.files.items()}
+        read = {name: functools.partial(read_mesh, path) for name, path in self.files.items()}
+        return read | {
+            f"{shapes.BESIDE_MESHES}{name}": functools.partial(shapes.make, name) for name in self.procedural
+        }
 
     def parameters(self) -> dict[str, Any]:
         """The digests of the files."""
         hashes = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in self.files.items()}
-        return {"source": "meshes", "shapes": hashes}
+        made = {"procedural": self.procedural, "version": shapes.VERSION} if self.procedural else {}
+        return {"source": "meshes", "shapes": hashes} | made

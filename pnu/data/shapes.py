@@ -8,6 +8,8 @@ from pnu.io import Mesh
 VERSION = 2  # of the shapes: a file of patches made from others is not used
 KINDS = {"organic": organic.SHAPES, "cad": cad.SHAPES}
 
+BESIDE_MESHES = "procedural/"  # before the names of these shapes where others are of meshes
+
 
 def names(*kinds: str) -> list[str]:
     """Names of the shapes of the kinds "organic" (smooth) and "cad" (sharp edges); of both by default.

@@ -17,7 +17,8 @@ def gather(features: Tensor, idx: Tensor) -> Tensor:
         )
     clouds, n, channels = features.shape
     first = torch.arange(clouds, device=idx.device).mul_(n).view(-1, *[1] * (idx.ndim - 1))
-    return features.reshape(clouds * n, channels)[(idx + first).flatten()].view(*idx.shape, channels)
+    # not by indexing, whose gradient sorts the indices on a GPU
+    return features.reshape(clouds * n, channels).index_select(0, (idx + first).flatten()).view(*idx.shape, channels)
 
 
 def interpolate(features: Tensor, points: Tensor, query: Tensor, k: int = 3) -> Tensor:

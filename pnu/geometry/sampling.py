@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from pnu.geometry.farthest_sampling import check_count, farthest_order
-from pnu.geometry.neighbor_search import gpu_kernels, nearest, per_cloud
+from pnu.geometry.neighbor_search import gpu_kernels, per_cloud
 
 NEAR_ORIGIN_SQ = 1e-3  # the released code's threshold on |x|^2
 
@@ -24,7 +24,10 @@ def farthest_points(points: Tensor, m: int, *, start: int | Tensor = 0, skip_nea
         raise ValueError(f"start: expected indices in 0..{n - 1}, found {start}")
     xyz = _float32(points.detach())
     if points.device.type != "cpu":
-        first = first.to(points.device)
+        # a number is written on the device itself: a copy would wait for all that it has to do
+        first = (
+            torch.full((clouds,), start, device=points.device) if isinstance(start, int) else first.to(points.device)
+        )
         kernels = gpu_kernels(xyz)
         if kernels and n <= kernels.FARTHEST_LIMIT:
             idx: Tensor = kernels.farthest_points(xyz, m, first, NEAR_ORIGIN_SQ if skip_near_origin else -1.0)
@@ -64,7 +67,9 @@ def nonuniform_points(points: Tensor, m: int, *, strength: float, centers: int, 
     if not 1 <= centers <= n:
         raise ValueError(f"centers: expected 1 to {n} centers, found {centers}")
     chosen = random_points(points, centers, generator=generator)
-    distance = nearest(points, points.gather(1, chosen[..., None].expand(-1, -1, 3))).dist_sq.sqrt()
+    distance = points.new_full((clouds, n), torch.inf)
+    for center in points.gather(1, chosen[..., None].expand(-1, -1, 3)).unbind(1):  # few: no search is worth it
+        distance = torch.minimum(distance, torch.linalg.vector_norm(points - center[:, None], dim=-1))
     fraction = distance / distance.amax(1, keepdim=True).clamp_min(torch.finfo(distance.dtype).tiny)
     noise = torch.empty(clouds, n, device=generator.device).exponential_(generator=generator)
     return (-strength * fraction - noise.to(points.device).log()).topk(m, dim=1).indices

@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import OneCycleLR
 
 from pnu.extras import needed
 from pnu.fast import accelerate
@@ -24,6 +25,7 @@ from pnu.upsamplers import dense_patches
 with needed("training"):
     import lightning.pytorch as pl
     from lightning.fabric.utilities.exceptions import MisconfigurationException
+    from lightning.pytorch.callbacks import Timer
     from lightning.pytorch.plugins.layer_sync import TorchSyncBatchNorm
     from lightning.pytorch.utilities.types import OptimizerLRScheduler
 
@@ -41,6 +43,7 @@ TRAINER_OPTIONS = {
     "inference_mode": False,  # its tensors would stay in the metrics, of no use to the training after them
     "use_distributed_sampler": False,
 }
+TIMED_STEPS = 10**6  # into which trainer.max_time is divided where the schedule follows it
 NOISE = (  # warnings of Lightning and torch that ask for what is meant as it is
     ".*does not have many workers.*",
     ".*is smaller than the logging interval.*",
@@ -129,7 +132,7 @@ class UpsamplingModule(pl.LightningModule):
         loss: called with prediction, target and extra; gives terms by name and their weighted sum as "loss".
         optimizer: called with the parameters.
         scheduler: called with the optimizer, stepped after each step. What it calls `total_steps` or `T_max` is the
-            number of steps of the whole training.
+            number of steps of the whole training; where trainer.max_time alone ends that, OneCycleLR follows the time.
         metrics: of validation and test, those that are for patches.
     """
 
@@ -147,8 +150,10 @@ class UpsamplingModule(pl.LightningModule):
         self.model = accelerate(model)
         self.loss = None if loss is None else accelerate(loss)
         self.optimizer, self.scheduler = optimizer, scheduler
+        self.timed_steps = 0  # of a schedule that follows the time
         normals = bool(getattr(model, "predicts_normals", True))
         self.val_metrics, self.test_metrics = CloudMetrics(normals, metrics), CloudMetrics(normals, metrics)
+        self.captured: Callable[[Batch], dict[str, Tensor]] | None = None  # `values` as a graph, see `captured_step`
         self.micro_batches: list[tuple[dict[str, Tensor], Batch]] = []  # of this step: values and batch
         self.started_at, self.elapsed_s = time.monotonic(), 0.0  # elapsed_s is the same in all processes
 
@@ -156,6 +161,13 @@ class UpsamplingModule(pl.LightningModule):
         return dense_patches(self.model, patch)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        values = (self.captured or self.values)(batch)
+        self.micro_batches.append(({name: value.detach() for name, value in values.items()}, batch))
+        loss: Tensor = values["loss"]
+        return loss
+
+    def values(self, batch: Batch) -> dict[str, Tensor]:
+        """Every term of the loss and "loss", with gradient, and the largest coordinate as "prediction"."""
         assert self.loss is not None
         outputs = {name: value.float() for name, value in self.model.outputs(batch["input"]).items()}
         found = {"prediction": outputs["prediction"].detach().abs().amax()}
@@ -167,9 +179,8 @@ class UpsamplingModule(pl.LightningModule):
             self.micro_batches.append((found, batch))
             self.check_finite(found)
             raise
-        self.micro_batches.append((found | {name: value.detach() for name, value in terms.items()}, batch))
-        loss: Tensor = terms["loss"]
-        return loss
+        values: dict[str, Tensor] = found | terms
+        return values
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """Checks and logs the step: means over micro-batches and processes, in one transfer from the device."""
@@ -188,8 +199,9 @@ class UpsamplingModule(pl.LightningModule):
         del values["prediction"]
         logged = {f"train/{name}": value for name, value in values.items()}
         logged |= {"train/gradient_norm": gradient_norm, "train/lr": float(optimizer.param_groups[0]["lr"])}
-        # as tensors of the CPU: a number would be sent to the device, and back where it is shown
-        self.log_dict({name: torch.tensor(value) for name, value in logged.items()}, logger=False)
+        # for bars and for stopping early; as a tensor of the CPU, since a number would be sent to the device and back.
+        # Lightning takes a millisecond for each, so the others go to the loggers alone
+        self.log("train/loss", torch.tensor(values["loss"]), logger=False)
         # written at once, before the checkpoint of this step: a training that is killed after it loses no step's values
         for logger in self.loggers:
             logger.log_metrics(logged, self.global_step)
@@ -237,6 +249,20 @@ class UpsamplingModule(pl.LightningModule):
         self.log_dict({f"{stage}/{name}": value for name, value in metrics.compute().items()}, sync_dist=True)
         metrics.reset()
 
+    def lr_scheduler_step(self, scheduler: Any, metric: Any) -> None:
+        """A step of the schedule; of a training that is as long as its time, to where the time is."""
+        timer = self.timer()
+        if self.timed_steps and timer:
+            passed, left = timer.time_elapsed(), timer.time_remaining() or 0.0
+            step = min(int(passed / (passed + left) * self.timed_steps), self.timed_steps - 1)
+            scheduler.last_epoch = max(scheduler.last_epoch, step - 1)
+        scheduler.step()
+
+    def timer(self) -> Timer | None:
+        """What ends the training after trainer.max_time; None without."""
+        callbacks: list[pl.Callback] = self.trainer.callbacks  # type: ignore[attr-defined]
+        return next((callback for callback in callbacks if isinstance(callback, Timer)), None)
+
     def configure_optimizers(self) -> OptimizerLRScheduler:
         assert self.optimizer is not None
         return self.scheduled(self.optimizer(self.parameters()))
@@ -247,10 +273,14 @@ class UpsamplingModule(pl.LightningModule):
             return optimizer
         cls = getattr(self.scheduler, "func", self.scheduler)
         horizon = {"total_steps", "T_max"} & inspect.signature(cls).parameters.keys()
-        if horizon and not math.isfinite(steps := self.trainer.estimated_stepping_batches):
-            raise ValueError(
-                "scheduler: needs to know the number of steps; give trainer.max_epochs or trainer.max_steps"
-            )
+        steps = self.trainer.estimated_stepping_batches
+        if horizon and not math.isfinite(steps):
+            if self.timer() is None or cls is not OneCycleLR:
+                raise ValueError(
+                    "scheduler: needs to know the number of steps; give trainer.max_epochs or trainer.max_steps, or for"
+                    " scheduler=onecycle trainer.max_time"
+                )
+            steps = self.timed_steps = TIMED_STEPS
         lengths: dict[str, Any] = {name: int(steps) for name in horizon}
         try:
             scheduler = self.scheduler(optimizer, **lengths)

@@ -42,6 +42,9 @@ def test_a_run_on_meshes_and_what_it_began_with(tmp_path: Path) -> None:
     assert trained.of(["mug", "pear"], True) == ["pear"]
     later = run(tmp_path / "later", {"root": root, "procedural": False, "validation": ["b"]}, weights=str(first))
     assert trained_on(later).of(["a", "b", "c"], False) == ["a", "b", "c"]  # b in the first, a in the second
+    both = {"root": root, "procedural": ["organic", "cad"], "val_share": 0.1, "test_share": 0.1}
+    seen = trained_on(run(tmp_path / "both", both))  # a split of all together
+    assert len(seen.of(list("abcd"), False)) + len(seen.of(shapes.names(), True)) == 95 - 2 * 10
     gone = run(tmp_path / "gone", {"root": "nowhere"}, weights="no/such/run")
     assert trained_on(gone).unknown == "its meshes in nowhere are not here"
     assert trained_on(run(tmp_path / "own", {}, weights="pnu")).of(shapes.names(), True)

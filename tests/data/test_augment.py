@@ -99,3 +99,15 @@ def test_one_switch_does_not_change_the_other_parts() -> None:
 def test_bad_ranges(options: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Augmentation(**options)
+
+
+def test_each_sample_of_a_batch_changes_in_its_own_way() -> None:
+    one = sample()
+    clouds = {name: cloud.repeat(8, 1, 1) for name, cloud in one.items()}
+    after = Augmentation(shift=0)(clouds, torch.Generator().manual_seed(0))
+    radius = after["target"][..., :3].norm(dim=-1)
+    torch.testing.assert_close(radius, radius.mean(1, keepdim=True).expand(8, 200))  # scaled and turned
+    assert len(radius.mean(1).unique()) == 8
+    torch.testing.assert_close(after["target"][..., 3:], after["target"][..., :3] / radius[..., None])
+    away = (after["input"] - after["target"][:, :50])[..., :3].norm(dim=-1).amax(1)
+    assert 0 < int((away > 1e-6).sum()) < 8  # jitter and small rotations, of some inputs

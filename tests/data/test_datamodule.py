@@ -61,6 +61,30 @@ def test_input_lies_in_its_own_unit_sphere_and_is_part_of_the_target(file: Path)
     assert len(points.unique(dim=0)) == 256  # without replacement
 
 
+def test_whole_batches_are_cut_where_they_are_trained_on(file: Path) -> None:
+    """As samples are: input out of the target, in its unit sphere; by seed, epoch and rows alone, and each its own."""
+    data = module(file, on_device=True, augmentation=None)
+
+    def batch(epoch: int) -> dict[str, Any]:
+        loader = data.train_dataloader()
+        loader.sampler.set_epoch(epoch)
+        found = next(iter(loader))
+        assert found["target"].shape == (2, 4096, 6)
+        return data.on_after_batch_transfer(found, 0)
+
+    first = batch(0)
+    assert (first["input"].shape, first["target"].shape) == ((2, 64, 6), (2, 256, 6))
+    assert float(first["input"][..., :3].mean(1).abs().max()) < 1e-6
+    torch.testing.assert_close(first["input"][..., :3].norm(dim=-1).amax(1), torch.ones(2))
+    distance = torch.cdist(first["input"], first["target"], compute_mode="donot_use_mm_for_euclid_dist")
+    assert float(distance.amin(2).max()) == 0
+    again = batch(0)
+    assert all(torch.equal(again[name], first[name]) for name in ("input", "target", "index"))
+    assert not torch.equal(batch(1)["input"], first["input"])
+    held_out = next(iter(data.val_dataloader()))
+    assert torch.equal(data.on_after_batch_transfer(held_out, 0)["input"], held_out["input"])
+
+
 def test_smaller_target_keeps_the_density(file: Path) -> None:
     with h5py.File(file) as opened:
         whole = torch.from_numpy(opened["poisson_4096"][3, :, :3])
@@ -214,6 +238,9 @@ def test_generated_file_is_reused_and_never_mistaken(tmp_path: Path) -> None:
     assert first.stat().st_mtime_ns == stamp
     write_mesh(tmp_path / "meshes" / "dice.off", shapes.make("nut"))
     assert MeshDataModule(**options, **SMALL).patch_file() != first
+    mixed = MeshDataModule(**options, **SMALL, procedural=["cad"])
+    assert set(mixed.makers()) == {*FOUR[:3], *(f"procedural/{name}" for name in shapes.names("cad"))}
+    assert mixed.parameters() != MeshDataModule(**options, **SMALL).parameters()
     assert SyntheticDataModule(patches=9).parameters() != SyntheticDataModule(kinds=["cad"], patches=9).parameters()
 
 

@@ -45,6 +45,27 @@ def test_knn_takes_the_first_of_equal_points() -> None:
     assert idx.tolist() == [[[0, 1, 2]]]
 
 
+@pytest.mark.parametrize("k", [2, 9])
+def test_knn_of_many_equal_distances(k: int) -> None:
+    """Three places of fifty points each: more are as near as the k-th than a kernel has room for."""
+    places = cloud(2, 3)
+    target = places.repeat(1, 50, 1)
+    dist_sq, idx = triton_kernels.knn(places.to(DEVICE), target.to(DEVICE), k)
+    assert torch.equal(dist_sq.cpu(), torch.zeros(2, 3, k))
+    assert torch.equal(idx.cpu(), (torch.arange(3)[:, None] + 3 * torch.arange(k)).expand(2, -1, -1))
+
+
+def test_knn_of_points_that_are_not_numbers() -> None:
+    """They are the farthest of all, and have no neighbors before others."""
+    target = cloud(1, 70)
+    target[0, 5] = torch.nan
+    dist_sq, idx = triton_kernels.knn(target.to(DEVICE), target.to(DEVICE), 4)
+    good = torch.arange(70) != 5
+    expected = distances_sq(target[:, good], target[:, good]).topk(4, largest=False)
+    torch.testing.assert_close(dist_sq.cpu()[:, good], expected.values)
+    assert torch.equal(idx.cpu()[:, good], torch.arange(70)[good][expected.indices])
+
+
 @pytest.mark.parametrize(("radius", "k"), [(0.05, 4), (0.2, 5), (2.0, 8)])
 def test_ball_query(radius: float, k: int) -> None:
     query, target = cloud(2, 20), cloud(2, 200)
@@ -171,7 +192,7 @@ def test_kernels_compile_for_a_gpu_that_is_not_here(capability: int, tmp_path: P
         pytest.skip(made.stderr.strip())
     assert made.returncode == 0, made.stderr
     sizes = [int(line) for line in made.stdout.split()]
-    assert len(sizes) == 8
+    assert len(sizes) == 9
     assert min(sizes) > 1000
 
 
@@ -193,9 +214,17 @@ def compiled(kernel, types, warps=4, **constants):
     built = triton.compile(source, target=GPUTarget("cuda", {capability}, 32), options=dict(num_warps=warps))
     print(len(built.asm["cubin"]))
 
-for k in (1, 2, 16, 64):
-    rows, columns = kernels.knn_block(k)
-    compiled(kernels._knn, [FLOAT, FLOAT, FLOAT, INDEX, "i32", "i32", "i32"], K=k, ROWS=rows, COLUMNS=columns)
+for k in (1, 2):
+    rows, columns, warps = kernels.nearest_block(k)
+    compiled(
+        kernels._nearest, [FLOAT, FLOAT, FLOAT, INDEX, "i32", "i32", "i32"], warps, K=k, ROWS=rows, COLUMNS=columns
+    )
+for k in (4, 16, 64):
+    columns, space = kernels.knn_columns(k)
+    compiled(
+        kernels._knn, [FLOAT, FLOAT, INDEX, FLOAT, INDEX, "i32", "i32", "i32"],
+        K=k, ROWS=16, COLUMNS=columns, SPACE=space, SORTED=max(32, k),
+    )
 for k in (1, 64):
     compiled(kernels._ball, [FLOAT, FLOAT, INDEX, "i32", "i32", "i32", "fp32"], K=k, ROWS=16, COLUMNS=128)
 for n in (1, kernels.FARTHEST_LIMIT):

@@ -8,6 +8,7 @@ from typing import Any
 import lightning.pytorch as pl
 import pytest
 import torch
+from lightning.pytorch.callbacks import Timer
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset, Subset
 
@@ -197,6 +198,24 @@ def test_schedule_of_an_endless_training_is_refused(tmp_path: Path) -> None:
         trainer(tmp_path, max_steps=-1, max_epochs=-1).fit(lit, loader(), loader(2))
 
 
+def test_schedule_follows_the_time_of_a_training_that_only_time_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A step a second: the rate of each second is that of its share of the ten."""
+    record = Record()
+    lit = module(scheduler=functools.partial(torch.optim.lr_scheduler.OneCycleLR, max_lr=1e-2, pct_start=0.5))
+    timed = trainer(tmp_path, record, max_steps=-1, max_epochs=-1, max_time="00:00:00:10")
+    monkeypatch.setattr(Timer, "time_elapsed", lambda self, *_: float(timed.global_step))
+    monkeypatch.setattr(Timer, "time_remaining", lambda self, *_: float(10 - timed.global_step))
+    timed.fit(lit, loader(), loader(2))
+    rates = record.values("train/lr")
+    assert len(rates) == 10
+    rising = [(1 - math.cos(math.pi * share / 0.5)) / 2 for share in (0, 0.1, 0.2, 0.3, 0.4, 0.5)]
+    assert rates[:6] == pytest.approx([4e-4 + (1e-2 - 4e-4) * part for part in rising], rel=1e-3)
+    falling = [(1 + math.cos(math.pi * (share - 0.5) / 0.5)) / 2 for share in (0.6, 0.7, 0.8, 0.9)]
+    assert rates[6:] == pytest.approx([1e-2 * part for part in falling], rel=1e-3)
+
+
 class Shares(pl.LightningDataModule):
     """Clouds of which each process sees its own: with two of them, three quarters and one."""
 
@@ -252,8 +271,8 @@ def test_logged_terms_are_means_over_processes(tmp_path: Path) -> None:
         assert found[-1].pop("elapsed") > 0
     assert found[1] == pytest.approx(found[0], rel=1e-5)
     values = [terms_of(i) for i in (0, 1)]
-    assert found[1]["train/cd"] == pytest.approx((values[0]["cd"] + values[1]["cd"]) / 2, rel=1e-5)
-    assert values[0]["cd"] != pytest.approx(values[1]["cd"], rel=1e-3)
+    assert found[1]["train/loss"] == pytest.approx((values[0]["loss"] + values[1]["loss"]) / 2, rel=1e-5)
+    assert values[0]["loss"] != pytest.approx(values[1]["loss"], rel=1e-3)
 
 
 def terms_of(index: int) -> dict[str, float]:
