@@ -48,6 +48,9 @@ class Compare:
     output: str | None = doc("folder for index.html, metrics.json, metrics.csv, figures/; null: in outputs/comparison/")
     surfaces: list[str] | None = doc("kinds of input whose clouds are made surfaces too; null: the first; []: none")
     shown: int = doc("shapes in the figures and 3D views, the first ones; the tables have all")
+    picture: str | None = doc(
+        "webp to write too, all shapes shown in one: their surfaces and errors, or with surfaces=[] clouds by normals"
+    )
     page_mb: float = doc("size that the page should not exceed by much, in MB: fewer points of each cloud are shown")
     colormap: str = doc("of errors. error: red = zero to blue = high, as the paper; perceptual: dark to light")
     up: str = doc("figures: axis that points up: x, y or z")
@@ -65,6 +68,7 @@ def compare(cfg: Any) -> None:
     _check_options(cfg)
     from pnu import benchmark, metrics
     from pnu.report import comparison_page
+    from pnu.report.comparison_tables import print_surfaces
     from pnu.training.run_folder import versions
 
     protocol, source = protocol_source(cfg)
@@ -110,6 +114,7 @@ def compare(cfg: Any) -> None:
             rebuilt_kinds=rebuilt_kinds,
             look=comparison_page.Look(cfg.up, cfg.azimuth, cfg.elevation, cfg.size, cfg.colormap),
             page_mb=cfg.page_mb,
+            picture=cfg.picture,
             metrics=chosen,
             seed=cfg.seed,
             step=step,
@@ -117,6 +122,8 @@ def compare(cfg: Any) -> None:
     for text in written.notes:
         warn(text)
     if not cfg.quiet:
+        print_surfaces(written.surfaces)
+        print(f"{provenance([1])}\n" + f"picture: {cfg.picture}\n" * (cfg.picture is not None))
         print(f"output: {output}/index.html ({written.size / 1e6:.1f} MB), metrics.json, metrics.csv, figures/")
         print(f"next:   open {output}/index.html in a browser")
 
@@ -199,6 +206,7 @@ def runs_of_sweep(method: str) -> list[str]:
 
 def _check_options(cfg: Any) -> None:
     """Refuse what can be refused before anything is loaded."""
+    from pnu.io import check_writable
     from pnu.rendering.colors import COLORMAPS
 
     for key, known in (("normals", ("given", "estimate")), ("colormap", tuple(COLORMAPS)), ("up", ("x", "y", "z"))):
@@ -211,6 +219,10 @@ def _check_options(cfg: Any) -> None:
     for key, least, most in (("shown", 1, 1000), ("page_mb", 1, 1000), ("size", 64, 2048)):
         if not least <= cfg[key] <= most:
             raise ValueError(f"{key}={cfg[key]:g}: expected a number from {least} to {most}")
+    if cfg.picture is not None:
+        if Path(cfg.picture).suffix.lower() != ".webp":
+            raise ValueError(f"picture={cfg.picture}: expected a name that ends in .webp")
+        check_writable(cfg.picture)
 
 
 main = command(compare, Compare)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Picture = NDArray[np.uint8]
+READABLE = 12  # pixels of text
 DPI = 100  # of the color bar: a unit of matplotlib's sizes
 
 
@@ -61,7 +62,8 @@ def figure(
     rows = [range(i, min(i + columns, len(panels))) for i in range(0, len(panels), columns)]
     left, right = extent(panels, 1, gap) if crop else (0, side)
     pad, width = gap, right - left
-    font = fitting_font(captions, side / 22, width)
+    size = max(side / 22, READABLE)
+    font = fitting_font(captions, size, width)
     line = int(1.35 * font.size)
     strips = []
     for row in rows:
@@ -77,7 +79,7 @@ def figure(
         strips.append(np.asarray(strip))
     picture = np.concatenate(strips)
     if colorbar is not None:
-        picture = np.concatenate([picture, draw_colorbar(colorbar, len(picture), side / 22)], axis=1)
+        picture = np.concatenate([picture, draw_colorbar(colorbar, len(picture), size)], axis=1)
     return np.pad(picture, ((gap, gap // 2), (gap, gap), (0, 0)), constant_values=255)
 
 

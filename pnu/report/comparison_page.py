@@ -6,10 +6,22 @@ from typing import Any, NamedTuple
 
 from pnu import rendering
 from pnu.benchmark import Row, write_results
+from pnu.io import atomic_path
 from pnu.metrics import METRICS, Metric
 from pnu.report import offline_page
 from pnu.report.comparison_tables import tables
-from pnu.report.shape_views import Look, Rebuilt, ShownCase, points_for, rebuild, shape_figure, surface_rows, view
+from pnu.report.shape_views import (
+    Look,
+    Rebuilt,
+    ShownCase,
+    normals_figure,
+    points_for,
+    rebuild,
+    shape_figure,
+    shapes_figure,
+    surface_rows,
+    view,
+)
 
 __all__ = ["Look", "ShownCase", "Written", "write_comparison"]
 
@@ -23,6 +35,7 @@ class Written(NamedTuple):
     size: int  # of the page, in bytes
     points: int  # of each cloud in the 3D views, at most
     notes: list[str]  # on surfaces that could not be made, or look wrong
+    surfaces: list[Row]  # their errors
 
 
 def write_comparison(
@@ -36,6 +49,7 @@ def write_comparison(
     rebuilt_kinds: Sequence[str] = (),
     look: Look = LOOK,
     page_mb: float = 40,
+    picture: str | Path | None = None,
     metrics: Sequence[Metric] = METRICS,
     seed: int = 0,
     step: Callable[[str], None] = lambda text: None,
@@ -49,6 +63,7 @@ def write_comparison(
         settings: kept in metrics.json.
         rebuilt_kinds: kinds of input whose clouds are made surfaces too, which takes seconds for each.
         page_mb: about the size of the page that is allowed; clouds are thinned to fit.
+        picture: webp to write, all shapes in one: surfaces and their errors, or clouds by normals if none is rebuilt.
         metrics: in the order of the tables.
         step: told what comes next, once for each of `shown`.
     """
@@ -66,9 +81,17 @@ def write_comparison(
         notes += said
         surfaces += surface_rows(one.case, made)
         if made or not rebuilt_kinds:
-            picture = shape_figure(one, made, look)
-            rendering.save_png(folder / "figures" / f"{shape}_{kind}.png", picture)
-            drawn[f"{shape}, {kind}"] = rendering.webp(picture)
+            figure = shape_figure(one, made, look)
+            rendering.save_png(folder / "figures" / f"{shape}_{kind}.png", figure)
+            drawn[f"{shape}, {kind}"] = rendering.webp(figure)
+    if picture and drawn:
+        pairs = [pair for pair in zip(shown, rebuilt, strict=True) if pair[1]]
+        errors = {(row["shape"], row["kind"], row["method"]): row.get("normal_unsigned_deg") for row in rows}
+        all_shapes = shapes_figure(pairs, look) if pairs else normals_figure(shown, errors, look)
+        with atomic_path(picture) as temporary:
+            temporary.write_bytes(rendering.webp(all_shapes, quality=80))
+    elif picture:
+        notes.append(f"{picture}: not written, since there are no surfaces")
     vertices = sum(len(surface.mesh.vertices) for made in rebuilt for surface in made.values())
     points = points_for(page_mb, sum(len(one.clouds) + 1 for one in shown), vertices)
     largest = max((len(cloud) for one in shown for cloud in (*one.clouds.values(), one.case.truth.samples)), default=0)
@@ -85,4 +108,4 @@ def write_comparison(
         figures=drawn,
         colormap=look.colormap,
     )
-    return Written(size, points, notes)
+    return Written(size, points, notes, surfaces)

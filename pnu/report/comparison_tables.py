@@ -9,6 +9,7 @@ from pnu.benchmark import Row, columns, summarize
 from pnu.benchmark.result_tables import REFERENCES, counts
 from pnu.metrics import METRICS, Metric, Shown
 from pnu.report import offline_page
+from pnu.report.html_tables import cell_text
 
 ACROSS = 6  # shapes in a table, twice: more do not fit a window of 1400 pixels
 SURFACE_COLUMNS = {
@@ -84,6 +85,16 @@ def surface_table(rows: Sequence[Row]) -> offline_page.Table:
 def table_value(row: Mapping[str, Any], shown: Shown) -> float | None:
     """A value times the factor of its table."""
     return shown.factor * row[shown.name] if shown.name in row else None
+
+
+def print_surfaces(rows: Sequence[Row]) -> None:
+    """The table of the surfaces of each kind of input, as Markdown."""
+    for kind in dict.fromkeys(row["kind"] for row in rows):
+        table = surface_table([row for row in rows if row["kind"] == kind])
+        heads = ["method", *(column.head for column in table.columns)]
+        lines = [heads, ["---"] * len(heads)]
+        lines += [[row.name, *(cell_text(value, ".2f") for value in row.values)] for row in table.rows]
+        print("\n".join([f"{kind}: {table.caption}", "", *(f"| {' | '.join(line)} |" for line in lines), ""]))
 
 
 def references_last(rows: Sequence[offline_page.Row]) -> list[offline_page.Row]:

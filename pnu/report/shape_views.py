@@ -1,5 +1,6 @@
 """Surfaces with their errors, figures and views of one shape."""
 
+import functools
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +13,7 @@ from pnu import reconstruction, rendering
 from pnu.benchmark import SCANS, Case, Row
 from pnu.benchmark.measuring import normals_of
 from pnu.geometry.mesh_sampling import closest_points
+from pnu.geometry.spacing import spacing
 from pnu.io import Mesh
 from pnu.rendering.colors import typical_limit, value_colors
 from pnu.report import offline_page
@@ -20,6 +22,8 @@ Picture = NDArray[np.uint8]
 
 BYTES_POINT, BYTES_VERTEX = 12.0, 21.0  # in a page, packed
 FEWEST = 1000  # points of a cloud that still show a shape
+BALL = 0.9  # radius of a point in a picture of normals, in spacings of as many even points
+FARTHEST = 1.25  # of what the true shape takes: what reaches beyond that is cut off in pictures
 REACH = 4.0  # spacings from all points beyond which the surface of a scan is cut off
 
 
@@ -126,10 +130,10 @@ def points_for(size_mb: float, clouds: int, vertices: int) -> int:
     return points
 
 
-def shape_figure(shown: ShownCase, rebuilt: Mapping[str, Rebuilt], look: Look) -> NDArray[np.uint8]:
+def shape_figure(shown: ShownCase, rebuilt: Mapping[str, Rebuilt], look: Look) -> Picture:
     """The paper's figure of one shape: clouds by normals; where rebuilt, surfaces; and the surfaces by error."""
     truth = shown.case.truth
-    camera = rendering.look_at(truth.samples, azimuth=look.azimuth, elevation=look.elevation, up=look.up)
+    camera = camera_of(shown, rebuilt, look)
     names = [*shown.clouds, "truth"]
     clouds = [or_crossed(rendering.render_cloud, cloud, camera, look) for cloud in shown.clouds.values()]
     clouds.append(rendering.render_cloud(truth.samples, camera=camera, size=look.size))
@@ -137,23 +141,90 @@ def shape_figure(shown: ShownCase, rebuilt: Mapping[str, Rebuilt], look: Look) -
         return rendering.figure(clouds, names, columns=len(names))
     kept = [name for name in names if name in rebuilt or name == "truth"]
     panels = [panel for name, panel in zip(names, clouds, strict=True) if name in kept]
-    limit = error_limit([surface.errors.distance for name, surface in rebuilt.items() if name != "input"])
-    bar = rendering.ColorBar((0, 1e3 * limit), "distance to the true surface, x 1e3 of its radius", look.colormap)
-    rms = {name: 1e3 * float(np.sqrt((surface.errors.distance**2).mean())) for name, surface in rebuilt.items()}
+    bar = error_bar([rebuilt], look)
+    panels += surface_panels(shown, rebuilt, kept, look, bar)
+    captions = [""] * (2 * len(kept)) + [surface_caption(name, rebuilt) for name in kept]
+    return rendering.figure(panels, captions, columns=len(kept), colorbar=bar)
+
+
+def shapes_figure(shapes: Sequence[tuple[ShownCase, Mapping[str, Rebuilt]]], look: Look) -> Picture:
+    """The paper's figure of several shapes, each seen by one camera: its surfaces and below them the same by error, on
+    one scale for all."""
+    names = [*shapes[0][0].clouds, "truth"]
+    bar = error_bar([made for _, made in shapes], look)
+    panels: list[Picture] = []
+    captions: list[str] = []
+    for one, made in shapes:
+        panels += surface_panels(one, made, names, look, bar)
+        captions += [""] * len(names) + [surface_caption(name, made) for name in names[:-1]]
+        captions.append(f"truth\n{one.case.truth.shape}")
+    return rendering.figure(panels, captions, columns=len(names), colorbar=bar)
+
+
+def normals_figure(
+    shown: Sequence[ShownCase], errors: Mapping[tuple[str, str, str], float | None], look: Look
+) -> Picture:
+    """Clouds by their normals, a row for each shape, seen by one camera; `errors` of the normals, in degrees, by shape,
+    kind and method."""
+    panels, captions = [], []
+    for one in shown:
+        truth, camera = one.case.truth, camera_of(one, {}, look)
+        even = BALL * spacing(truth.samples[:, :3]) * len(truth.samples) ** 0.5  # of balls as close as the truth's
+        for cloud in (*one.clouds.values(), truth.samples):
+            render = functools.partial(rendering.render_cloud, radius=even / len(cloud) ** 0.5)
+            panels.append(or_crossed(render, cloud, camera, look))
+        for name in one.clouds:
+            error = errors.get((truth.shape, one.case.kind, name))
+            captions.append(name if error is None else f"{name}\n{error:.1f} degrees")
+        captions.append(f"truth\n{truth.shape}")
+    return rendering.figure(panels, captions, columns=len(panels) // len(shown))
+
+
+def camera_of(shown: ShownCase, rebuilt: Mapping[str, Rebuilt], look: Look) -> rendering.Camera:
+    """The camera that sees the true shape, and what the methods made of it unless that lies far off."""
+    truth = rendering.look_at(shown.case.truth.samples, azimuth=look.azimuth, elevation=look.elevation, up=look.up)
+    made = [
+        *(cloud[:, :3] for cloud in shown.clouds.values()),
+        *(surface.mesh.vertices for surface in rebuilt.values()),
+    ]
+    reach = max(float(np.abs(truth.view(points)[:, :2]).max()) for points in made)
+    return truth._replace(half_size=truth.half_size * min(FARTHEST, max(1, 1.03 * reach)))
+
+
+def error_bar(rebuilt: Sequence[Mapping[str, Rebuilt]], look: Look) -> rendering.ColorBar:
+    """The scale of errors for all surfaces of some shapes, in thousandths of the true radius."""
+    distances = [surface.errors.distance for made in rebuilt for name, surface in made.items() if name != "input"]
+    label = "distance to the true surface, x 1e3 of its radius"
+    return rendering.ColorBar((0, 1e3 * error_limit(distances)), label, look.colormap)
+
+
+def surface_panels(
+    shown: ShownCase, rebuilt: Mapping[str, Rebuilt], names: Sequence[str], look: Look, bar: rendering.ColorBar
+) -> list[Picture]:
+    """A row of the surfaces of these names, and one of the same colored by error; "truth" is gray in both."""
+    camera = camera_of(shown, rebuilt, look)
     plain, colored = [], []
-    for name in kept:
-        mesh = rebuilt[name].mesh if name in rebuilt else truth.mesh
-        colors = value_colors(rebuilt[name].errors.distance, (0, limit), look.colormap) if name in rebuilt else None
+    for name in names:
+        made = rebuilt.get(name)
+        mesh = made.mesh if made else shown.case.truth.mesh if name == "truth" else None
+        colors = value_colors(1e3 * made.errors.distance, bar.limits, bar.colormap) if made else None
         plain.append(or_crossed(rendering.render_mesh, mesh, camera, look))
         colored.append(or_crossed(rendering.render_mesh, mesh, camera, look, colors))
-    below = [f"{name}\nRMS {rms[name]:.2f}" if name in rms else name for name in kept]
-    captions = [""] * (2 * len(kept)) + below
-    return rendering.figure([*panels, *plain, *colored], captions, columns=len(kept), colorbar=bar)
+    return [*plain, *colored]
+
+
+def surface_caption(name: str, rebuilt: Mapping[str, Rebuilt]) -> str:
+    """The name, and the error of its surface where it has one."""
+    if name not in rebuilt:
+        return name
+    return f"{name}\nRMS {1e3 * float(np.sqrt((rebuilt[name].errors.distance ** 2).mean())):.2f}"
 
 
 def or_crossed(render: Callable[..., Picture], what: Any, camera: rendering.Camera, look: Look, *args: Any) -> Picture:
-    """A panel, or a gray cross where a method's result is nowhere near the true shape."""
+    """A panel, or a gray cross where a method has no result (None) or one nowhere near the true shape."""
     try:
+        if what is None:
+            raise ValueError("no surface")
         return render(what, *args, camera=camera, size=look.size)
     except ValueError:
         panel = np.full((look.size, look.size, 3), 255, np.uint8)

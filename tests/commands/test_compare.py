@@ -13,12 +13,14 @@ from PIL import Image
 from pnu.benchmark import Case, Truth
 from pnu.commands.compare import main, runs_of_sweep
 from pnu.geometry.mesh_sampling import sample_poisson_disk
-from pnu.io import read_json, write_json, write_mesh
+from pnu.io import Mesh, read_json, write_json, write_mesh
 from pnu.networks import checkpoints
 from pnu.networks.pnu import PNU
+from pnu.reconstruction import SurfaceErrors
+from pnu.rendering import ColorBar
 from pnu.report import comparison_page
-from pnu.report.comparison_tables import tables
-from pnu.report.shape_views import error_limit, points_for, rebuild, view
+from pnu.report.comparison_tables import print_surfaces, tables
+from pnu.report.shape_views import Look, Rebuilt, error_limit, points_for, rebuild, surface_panels, view
 from tests.chromium import CHROMIUM
 from tests.reconstruction.test_surfaces import icosphere
 from tests.report.test_page import browse
@@ -45,7 +47,7 @@ def made(place: Path) -> Path:
     """The comparison of two classical methods, one under another name."""
     methods = "methods=[apss,plain:midpoint]"
     data = ["data=meshes", f"data.root={place}/meshes", "kinds=[uniform,sparse]", "shown=1"]
-    main([methods, *data, *SMALL, f"output={place}/out"])
+    main([methods, *data, *SMALL, f"output={place}/out", f"picture={place}/all.webp"])
     return place / "out"
 
 
@@ -85,6 +87,14 @@ def test_surfaces_of_the_first_kind_are_measured(made: Path) -> None:
     assert not (made / "figures" / "ball_sparse.png").exists()
 
 
+def test_one_picture_of_surfaces_and_below_them_their_errors(made: Path) -> None:
+    picture = np.asarray(Image.open(made.parent / "all.webp").convert("RGB")).astype(int)
+    colored = np.ptp(picture, axis=2) > 100
+    methods = colored[:, :300]  # input, apss, plain; not the scale
+    assert methods[: len(methods) // 3].sum() == 0
+    assert methods[len(methods) // 2 :].sum() > 1000
+
+
 def test_views_hold_every_method_and_the_truth(made: Path) -> None:
     uniform, sparse = views(made / "index.html")
     assert (uniform["shape"], uniform["kind"], sparse["kind"]) == ("ball", "uniform", "sparse")
@@ -109,7 +119,7 @@ def test_page_is_drawn_in_a_browser(made: Path, tmp_path: Path) -> None:
 
 def test_same_seed_same_numbers(made: Path, place: Path) -> None:
     data = ["data=meshes", f"data.root={place}/meshes", "kinds=[sparse]", "surfaces=[]", "shapes=[egg]"]
-    main(["methods=[apss]", *data, *SMALL, f"output={place}/again"])
+    main(["methods=[apss]", *data, *SMALL, f"output={place}/again", f"picture={place}/normals.webp"])
     names = ("chamfer_sq", "hausdorff_sq", "p2f", "normal_deg")
     first, second = (
         [[row[name] for name in names] for row in read_json(folder / "metrics.json")["rows"]
@@ -118,6 +128,8 @@ def test_same_seed_same_numbers(made: Path, place: Path) -> None:
     )  # fmt: skip
     assert first == second
     assert (place / "again" / "figures" / "egg_sparse.png").is_file()  # clouds only
+    normals = np.asarray(Image.open(place / "normals.webp").convert("RGB")).astype(int)
+    assert (np.ptp(normals, axis=2) > 60).mean() > 0.1
 
 
 def test_columns_of_pairs_as_text(place: Path, tmp_path: Path) -> None:
@@ -179,6 +191,20 @@ def test_a_surface_that_fails_is_left_out_and_said(monkeypatch: pytest.MonkeyPat
     assert notes == ["input, ball, uniform: Poisson reconstruction at depth=6 was killed by SIGSEGV"]
 
 
+def test_pictures_have_room_for_surfaces_larger_than_the_truth() -> None:
+    shown = comparison_page.ShownCase.of(case())
+    truth = shown.case.truth.mesh
+    assert truth is not None
+    for size, most in ((1.15, 0), (2.0, np.inf)):  # the second is cut off: it would make all others small
+        error = np.full(len(truth.vertices), size - 1)
+        made = {"input": Rebuilt(Mesh(size * truth.vertices, truth.faces), SurfaceErrors(error, error, error, 1))}
+        panels = surface_panels(shown, made, ["input", "truth", "none"], Look(size=80), ColorBar((0, 200)))
+        assert len(panels) == 6
+        borders = np.concatenate([np.concatenate([p[0], p[-1], p[:, 0], p[:, -1]]) for p in panels])
+        assert (borders < 255).sum() <= most
+        assert 50 < (panels[1] < 255).any((0, 2)).sum() < 80
+
+
 def test_clouds_are_thinned_to_the_size_of_the_page() -> None:
     shown = comparison_page.ShownCase.of(case())
     drawings = view(shown, {}, 90).drawings
@@ -192,7 +218,7 @@ def test_clouds_are_thinned_to_the_size_of_the_page() -> None:
     )
 
 
-def test_a_method_that_lacks_a_surface_has_no_mean() -> None:
+def test_a_method_that_lacks_a_surface_has_no_mean(capsys: pytest.CaptureFixture[str]) -> None:
     row = {"shape": "a", "kind": "k", "points_in": 1, "points_out": 4, "chamfer_sq": 1e-3, "hausdorff_sq": 2e-3}
     rows = [row | {"method": m, "shape": s} for s in "ab" for m in ("x", "y")]
     errors = dict.fromkeys(
@@ -208,6 +234,8 @@ def test_a_method_that_lacks_a_surface_has_no_mean() -> None:
         ("HD", "b"),
     ]
     assert {row.name: row.values[0] for row in surface.rows} == {"x": 1.0, "y": None}
+    print_surfaces(surfaces)
+    assert "| x | 1.00 | 1.00 | 1.00 | 1.00 | 1.00 | 0.00 |\n| y | - | - |" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -225,6 +253,8 @@ def test_a_method_that_lacks_a_surface_has_no_mean() -> None:
         (["methods=[apss]", "output=/proc/none/x"], "output=/proc/none/x: cannot be made a folder"),
         (["methods=[apss]", "normals=none"], "normals=none: expected given or estimate"),
         (["methods=[apss]", "colormap=jet"], "colormap=jet: expected error or perceptual"),
+        (["methods=[apss]", "picture=all.png"], "picture=all.png: expected a name that ends in .webp"),
+        (["methods=[apss]", "picture=none/all.webp"], "the folder none does not exist"),
         (["methods=[apss]", "page_mb=0"], "page_mb=0: expected a number from 1 to 1000"),
         (["methods=[apss]", "surface=[]"], "did you mean 'surfaces'"),
         ([], "methods=... is required"),
