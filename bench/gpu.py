@@ -4,17 +4,16 @@ Parts, in this order; each writes its lines to FOLDER/gpu.md when it is done, so
 happens after it:
 
 - `kernels`: the Triton searches against their slow twins, same neighbors and how many times as fast
-- `step`: the training step of the paper's size, 20 x 1024 -> 4096, forward, loss, backward, Adam, at each precision,
-  and where its time goes
+- `step`: the training step of the paper's size, 20 x 1024 -> 4096, forward, loss, backward, Adam, at each precision and
+  as a CUDA graph, and where its time goes
 - `upsample`: shipped models on the GPU beside the CPU
 - `schedule`: trains the paper's network (`scale=full`) for the minutes that are left, with checkpoints, in FOLDER/run;
-  the same command goes on where it ended
+  whole batches are cut on the GPU, the step is captured, and the rate follows the time
 
 `--device cpu --small` tries all of it without a GPU, in a minute or two; the numbers then mean nothing.
 """
 
 import argparse
-import os
 import subprocess
 import sys
 import time
@@ -108,6 +107,8 @@ def step_lines(plan: Plan) -> Iterator[str]:
         ("bfloat16", "high", torch.bfloat16),
     ):
         networks[name] = training(plan, batch, precision, dtype)
+    if plan.device.type == "cuda":
+        networks["TF32, a graph"] = captured(networks["TF32"])
     row = plan.compare(f"training step, {len(inputs)} x {inputs.shape[1]} -> {target.shape[1]}", networks)
     torch.set_float32_matmul_precision("highest")
     for name, seconds in row.seconds.items():
@@ -126,7 +127,8 @@ def training(
     """A step of a network of its own; `dtype` of autocast, with the loss in float32 as in training."""
     torch.manual_seed(0)
     network, loss = PNU().to(plan.device), CompoundLoss().to(plan.device)
-    optimizer = torch.optim.Adam(network.parameters(), 1e-3, weight_decay=1e-5)
+    capturable = plan.device.type == "cuda"
+    optimizer = torch.optim.Adam(network.parameters(), 1e-3, weight_decay=1e-5, capturable=capturable)
 
     def forward(inputs: Tensor) -> Tensor:
         with torch.autocast(plan.device.type, dtype) if dtype else nullcontext():
@@ -138,6 +140,20 @@ def training(
         return step(forward, loss, optimizer, batch)
 
     return run
+
+
+def captured(run: Callable[[], object]) -> Callable[[], object]:
+    """A step as one CUDA graph, after the trial runs that a capture wants."""
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        for _ in range(3):
+            run()
+    torch.cuda.current_stream().wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        run()
+    return graph.replay
 
 
 def upsample_lines(plan: Plan) -> Iterator[str]:
@@ -162,13 +178,19 @@ def schedule_lines(plan: Plan) -> Iterator[str]:
     length = time.strftime("00:%H:%M:%S", time.gmtime(seconds))
     arguments = [f"run={run}", f"trainer.max_time={length}", "quiet=true"]
     if not (run / "config.yaml").exists():
+        arguments += ["scheduler=onecycle", "trainer.max_epochs=-1", "data.on_device=true"]
         arguments += ["scale=small", "data.patches=100"] if plan.small else ["scale=full", "data.patches=4000"]
-        arguments += [f"trainer={'gpu' if plan.device.type == 'cuda' else 'cpu'}"]
-        arguments += (
-            ["trainer.max_steps=3", "trainer.val_check_interval=3"]
-            if plan.small
-            else [f"data.workers={max(0, (os.cpu_count() or 1) - 2)}"]
-        )
+        if plan.device.type == "cuda":
+            arguments += [
+                "trainer=gpu",
+                "data.workers=4",
+                "callbacks=[default,cuda_graph]",
+                "callbacks.cuda_graph.tf32=true",
+            ]
+        else:
+            arguments += ["trainer=cpu"]
+        if plan.small:
+            arguments += ["trainer.max_steps=3", "trainer.val_check_interval=3"]
     started = time.monotonic()
     done = subprocess.run([sys.executable, "-m", "pnu.train", *arguments], capture_output=True, text=True, check=False)
     yield f"- schedule: {' '.join(arguments[1:])}, {time.monotonic() - started:.0f} s, exit code {done.returncode}"
