@@ -19,6 +19,7 @@ Character = Literal["clean", "scanned", "noisy"]
 """What a cloud is like: clean and scanned ones show little noise, scanned ones lie in lines or have many strays."""
 NOISY = 0.17  # spacings of noise from which on a cloud is noisy; then what looks stray says nothing of scans
 MANY_ENOUGH = 1000  # points that tell noise from what they do not resolve
+MANY_TO_SMOOTH = 4000  # points of which the 64 neighbors of the weights for noise are a small place
 
 __all__ = ["TREATMENTS", "Character", "Cleaned", "Treatment", "clean_cloud", "is_noisy", "stray_points"]
 
@@ -76,9 +77,14 @@ def clean_cloud(
     if cloud.normals is None and is_noisy(cloud.points):  # or has thin walls, whose sides normals tell apart
         estimated = settled_normals(cloud.points, None).normals
         if is_noisy(cloud.points, estimated):
-            return Cleaned(cloud, stray, "noisy", estimated)
+            return Cleaned(cloud, stray, noisy_character(cloud.points), estimated)
         return Cleaned(cloud, stray, "scanned" if share > MANY else "clean", estimated)
     return Cleaned(cloud, stray, "scanned" if cloud.normals is None and share > MANY else "clean")
+
+
+def noisy_character(points: NDArray[np.float64]) -> Character:
+    """What a noisy cloud is taken for: of few points, weights for noise would smooth over parts and between walls."""
+    return "noisy" if len(points) >= MANY_TO_SMOOTH else "clean"
 
 
 def is_noisy(points: NDArray[np.float64], normals: NDArray[np.float64] | None = None) -> bool:

@@ -169,9 +169,10 @@ def test_scanned_clouds_take_weights_of_their_own() -> None:
 
 def test_noisy_clouds_take_weights_of_their_own() -> None:
     rng = np.random.default_rng(0)
-    unit = rng.normal(size=(2000, 3))
+    unit = rng.normal(size=(4200, 3))
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
     noisy = unit + 0.03 * rng.normal(size=unit.shape)
+    assert clean_cloud(Cloud(noisy[:2000], None, {})).character == "clean"  # they would smooth over parts of so few
     assert clean_cloud(Cloud(unit, None, {})).character == "clean"
     assert clean_cloud(Cloud(noisy, unit, {})).character == "clean"  # where normals are given they tell
     cleaned = clean_cloud(Cloud(noisy, None, {}))
