@@ -13,6 +13,10 @@ KINDS = (
     "simulated scans: orbit, oneview, lines, photo, flipped; null: the protocol's"
 )
 
+MERGE = (
+    "of networks of patches: farthest: the farthest points of all predictions, as in the paper; agreed: where the "
+    "predictions of overlapping patches, each in two orientations, agree"
+)
 KEEP = "of surface: true: the points given are in the result, unmoved; false: all are new; auto: as pnu upsample"
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pnu.commands._entry import command, warn
-from pnu.commands._protocol import KEEP, KINDS, protocol_source
+from pnu.commands._protocol import KEEP, KINDS, MERGE, protocol_source
 from pnu.config.instantiate import find_metric
 from pnu.config.quoting import quoted, typed_line
 from pnu.config.schema import Group, doc
@@ -41,6 +41,7 @@ class Compare:
     )
     ratio: float = doc("points out for each point in")
     passes: bool = doc("also networks that were trained for another ratio: by passes and farthest points")
+    merge: str = doc(MERGE)
     keep: str = doc(KEEP)
     normals: str = doc("of the inputs: given, those of the shape; estimate: none, which surface has weights for")
     metrics: list[str] = doc("classes of metrics of your own, measured beside pnu's: [mylab.Roughness]")
@@ -128,7 +129,7 @@ def compare(cfg: Any) -> None:
         print(f"next:   open {output}/index.html in a browser")
 
 
-SETTINGS = ("methods", "points", "truth_points", "ratio", "keep", "normals", "seed")
+SETTINGS = ("methods", "points", "truth_points", "ratio", "merge", "keep", "normals", "seed")
 
 
 def upsamplers(cfg: Any) -> dict[str, "Method"]:
@@ -164,6 +165,7 @@ def upsamplers(cfg: Any) -> dict[str, "Method"]:
             model,
             cfg.ratio,
             passes=cfg.passes,
+            merge=cfg.merge,
             keep=cfg.keep,
             name=method,
             batch_size=cfg.batch_size,

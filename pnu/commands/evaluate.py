@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from pnu.commands._entry import command
 from pnu.commands._normal_task import evaluate_task
-from pnu.commands._protocol import KEEP, KINDS, protocol_source
+from pnu.commands._protocol import KEEP, KINDS, MERGE, protocol_source
 from pnu.config.instantiate import find_metric
 from pnu.config.quoting import shell_line
 from pnu.config.schema import Group, doc
@@ -16,7 +16,7 @@ from pnu.runtime.provenance import provenance
 
 NORMALS = {"given": "as given", "estimate": "estimated"}
 DEFAULT = "surface"  # without run= and method=
-SETTINGS = ("ratio", "points", "truth_points", "keep", "normals", "search", "passes", "seed")
+SETTINGS = ("ratio", "points", "truth_points", "merge", "keep", "normals", "search", "passes", "seed")
 
 
 @dataclass
@@ -46,6 +46,7 @@ class Evaluate:
     )
     ratio: float = doc("points out for each point in")
     passes: bool = doc("also where the network was trained for another ratio: by passes and farthest points")
+    merge: str = doc(MERGE)
     keep: str = doc(KEEP)
     normals: str = doc("of the inputs: given, those of the shape; estimate: none, which run=surface has weights for")
     search: str = doc("for closest surface points. exact; open3d: as other scripts (differs in the faces at edges)")
@@ -84,8 +85,8 @@ def evaluate(cfg: Any) -> None:
     else:
         model = classical(subject) if cfg.method else benchmark.measured_network(subject, cfg.allow)
         upsampler = benchmark.network_upsampler(
-            model, cfg.ratio, passes=cfg.passes, keep=cfg.keep, name=subject, patch_size=cfg.patch_size,
-            batch_size=cfg.batch_size, device=cfg.device, seed=cfg.seed,
+            model, cfg.ratio, passes=cfg.passes, merge=cfg.merge, keep=cfg.keep, name=subject,
+            patch_size=cfg.patch_size, batch_size=cfg.batch_size, device=cfg.device, seed=cfg.seed,
         )  # fmt: skip
     is_run = not cfg.method and Path(subject).is_dir()
     name = run_name(subject) if is_run else Path(subject).stem

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from pnu.commands import _filled, _sides, _tiles
 from pnu.commands._entry import command
+from pnu.commands._protocol import MERGE
 from pnu.config.quoting import shell_line
 from pnu.config.schema import doc
 from pnu.runtime.progress import stages
@@ -36,6 +37,7 @@ class Upsample:
     )
     ratio: float = doc("points out for each point in, any number >= 1")
     spacing: float | None = doc("instead of ratio: the distance wanted between points, in the cloud's unit")
+    merge: str = doc(MERGE)
     density: str = doc(
         "of surface: even; follow: every point becomes as many; auto: even where no place loses points by it"
     )
@@ -137,6 +139,7 @@ def upsample(cfg: Any) -> None:
             cloud.points,
             cloud.normals,
             ratio=count / len(cloud.points),
+            merge=cfg.merge,
             density=cfg.density,
             keep=keep,
             outliers="keep",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 
 from pnu.runtime.parts import Parts
 from pnu.runtime.progress import Progress, silent
@@ -15,10 +15,12 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
+Merge = Literal["farthest", "agreed"]
+
 
 @dataclass(frozen=True)
 class Context:
-    """How an upsampler runs. Seed, density and keep have an influence on what comes out, nothing else."""
+    """How an upsampler runs. Seed, density, keep and merge have an influence on what comes out, nothing else."""
 
     device: torch.device | str = "cpu"
     """Where the network lies, and the cloud."""
@@ -36,6 +38,8 @@ class Context:
     """Of what comes out: even, follow the cloud's, or auto: even where no place loses points by it."""
     keep: bool = False
     """Whether the points of the cloud are to be among those that come out, unmoved."""
+    merge: Merge = "farthest"
+    """Of the predictions of patches that overlap, see `pnu.upsamplers.patches`."""
 
     @cached_property
     def generator(self) -> torch.Generator:

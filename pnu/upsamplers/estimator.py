@@ -11,7 +11,7 @@ import numpy as np
 
 from pnu.cleaning import Treatment
 from pnu.runtime.progress import Progress, silent
-from pnu.upsamplers.context import Upsampler
+from pnu.upsamplers.context import Merge, Upsampler
 from pnu.upsamplers.density import Density
 from pnu.upsamplers.inference import LoadedWeights
 from pnu.upsamplers.whole_clouds import CloudT, Model, upsample
@@ -48,6 +48,7 @@ class PointCloudUpsampler:
         spacing: float | None = None,
         model: nn.Module | Upsampler | str | PathLike[str] = "surface",
         patch_size: int | None = None,
+        merge: Merge = "farthest",
         density: Density = "auto",
         keep: bool | Literal["auto"] = "auto",
         outliers: Treatment = "auto",
@@ -61,7 +62,7 @@ class PointCloudUpsampler:
         progress: Progress = silent,
     ) -> None:
         self.ratio, self.spacing, self.model, self.patch_size = ratio, spacing, model, patch_size
-        self.density, self.keep, self.holes = density, keep, holes
+        self.merge, self.density, self.keep, self.holes = merge, density, keep, holes
         self.outliers, self.lines, self.signs = outliers, lines, signs
         self.device, self.devices, self.batch_size = device, devices, batch_size
         self.seed, self.progress = seed, progress

@@ -10,7 +10,7 @@ from dataclasses import replace
 from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, get_args, overload
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from pnu.runtime.parts import Parts
 from pnu.runtime.progress import Progress, silent
 from pnu.runtime.threads import thread_count, torch_if_loaded
 from pnu.runtime.workers import Processes
-from pnu.upsamplers.context import Context, Upsampler
+from pnu.upsamplers.context import Context, Merge, Upsampler
 from pnu.upsamplers.density import DENSITIES, Density, count_of_spacing
 from pnu.upsamplers.inference import LoadedWeights, inferring, modules_of, on_device
 from pnu.upsamplers.learned_normals import learned_normals
@@ -59,6 +59,7 @@ def upsample(
     spacing: float | None = None,
     model: Model = "surface",
     patch_size: int | None = None,
+    merge: Merge = "farthest",
     density: Density = "auto",
     keep: bool | Literal["auto"] = "auto",
     outliers: Treatment = "auto",
@@ -83,6 +84,7 @@ def upsample(
     spacing: float | None = None,
     model: Model = "surface",
     patch_size: int | None = None,
+    merge: Merge = "farthest",
     density: Density = "auto",
     keep: bool | Literal["auto"] = "auto",
     outliers: Treatment = "auto",
@@ -106,6 +108,7 @@ def upsample(
     spacing: float | None = None,
     model: Model = "surface",
     patch_size: int | None = None,
+    merge: Merge = "farthest",
     density: Density = "auto",
     keep: bool | Literal["auto"] = "auto",
     outliers: Treatment = "auto",
@@ -139,6 +142,9 @@ def upsample(
             the run that finished last under outputs/, or an upsampler: "apss", "poisson", "midpoint", or one's own.
             "surface" takes the weights made for estimated normals where none are given.
         patch_size: points of a patch, at least 16; None: what the network was made for. "surface" has no patches.
+        merge: of networks of patches. "farthest": the farthest points of all predictions, as in the paper; "agreed":
+            each patch is seen in two orientations, and points lie where the predictions around them agree, in twice
+            the time.
         density: of the points of "surface". "even" over the surface; "follow": each point becomes `ratio`; "auto": even
             where no place loses points by it, elsewhere those that it has.
         keep: of "surface". True: the points given are among those that come out, first and unmoved, and new ones fill
@@ -194,6 +200,8 @@ def upsample(
         raise ValueError(f"holes={_short(holes)}: expected a radius above 0 in the unit of the points")
     if density not in DENSITIES:
         raise ValueError(f"density={density}: expected {', '.join(DENSITIES)}")
+    if merge not in get_args(Merge):
+        raise ValueError(f"merge={merge}: expected {' or '.join(get_args(Merge))}")
     if keep not in (True, False, "auto"):
         raise ValueError(f"keep={keep}: expected true, false or auto")
     given, _, character, estimated = clean_cloud(
@@ -212,9 +220,9 @@ def upsample(
         )
     follows = getattr(upsampler, "follows", False)
     keeps = (follows and is_clean_and_even(sparse)) if keep == "auto" else keep
-    digest = _digest(network, sparse, count, upsampler, density, keeps)
+    digest = _digest(network, sparse, count, upsampler, density, keeps, merge)
     finished = Parts() if parts is None else Parts(Path(parts) / digest)
-    context = Context(target, batch_size, int(seed), progress, finished, density=density, keep=keeps)
+    context = Context(target, batch_size, int(seed), progress, finished, density=density, keep=keeps, merge=merge)
     with inferring(network), ExitStack() as stack:
         if devices > 1:
             theirs = copy.deepcopy(network).cpu() if modules_of(network) else network
