@@ -143,7 +143,7 @@ def test_a_metric_that_is_not_measured_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("untraced")
-def test_a_sweep_prunes_skips_and_goes_on(
+def test_a_sweep_prunes_skips_reports_and_goes_on(
     patch_file: Path,  # noqa: F811
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -172,6 +172,12 @@ def test_a_sweep_prunes_skips_and_goes_on(
     out = capsys.readouterr().out
     assert (out.count("has finished before, skipped"), out.count("was pruned before, skipped")) == (1, 1)
     assert records(sweep) == before
+
+    from pnu.commands.report import main as report
+
+    report([f"sweep={sweep}"])
+    assert "1 settings, 1 finished runs, 1 pruned, 2 unfinished" in capsys.readouterr().out
+    assert f"- {name}: {record['pruned']}" in (sweep / "report" / "report.md").read_text()
 
     resume(sweep / name)  # by itself it goes on to its end
     after = json.loads((sweep / name / "run.json").read_text())
