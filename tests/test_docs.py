@@ -44,6 +44,7 @@ CROPS = [
     *("trainer.max_steps=2", "trainer.accelerator=cpu", "trainer.val_check_interval=1", "callbacks.pictures.clouds=0"),
 ]  # of a training of `surface`
 SWEPT = ["setting=default", "seed=0"]  # of an ablation
+SEARCHED = ["hydra.sweeper.n_trials=1"]
 PRELUDE = "from pnu.io import read_cloud\npoints = read_cloud('scan.ply').points\n"  # what the README takes as given
 
 
@@ -161,6 +162,7 @@ def run_line(folder: Path, line: str) -> None:
         keep = {"shapes", "kinds", "points"} & given
         arguments += [option for option in short if option.partition("=")[0] not in keep]
         arguments += SWEPT if "ablation" in given else []
+        arguments += SEARCHED if "hparams_search" in given else []
     run(folder, [sys.executable, "-m", "pnu", *arguments])
 
 

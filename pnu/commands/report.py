@@ -34,8 +34,9 @@ def report(cfg: Any) -> None:
     if cfg.quiet:
         print(page)
         return
+    pruned = f"{len(found.pruned)} pruned, " if found.pruned else ""
     runs = sum(len(setting.runs) for setting in found.settings)
-    print(f"{len(found.settings)} settings, {runs} finished runs, {len(found.unfinished)} unfinished")
+    print(f"{len(found.settings)} settings, {runs} finished runs, {pruned}{len(found.unfinished)} unfinished")
     for run in found.unfinished:
         print(f"  {run.folder}: {status(run)}")
     print(f"report folder: {page.parent}")

@@ -106,7 +106,8 @@ def train(cfg: Any) -> list[float] | None:
         trainer.fit(module, data, ckpt_path=start, weights_only=True)
         if run.best.exists():
             module.load_state_dict(checkpoints.read_checkpoint(run.best)["state_dict"])
-        run.add_metrics("test", trainer.test(module, data, verbose=False))
+        if not run.pruned:
+            run.add_metrics("test", trainer.test(module, data, verbose=False))
         result = objective(config, run)
     if is_main_process():
         print(run if config["quiet"] else job_line(run) if "job" in run.facts else closing_lines(run))

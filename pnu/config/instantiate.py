@@ -22,7 +22,7 @@ LENGTH = "is the number of steps of the training; trainer.max_steps or trainer.m
 GIVEN = {  # arguments that the program gives, and why a config cannot
     "optimizer": {"params": "are the network's"},
     "scheduler": {"optimizer": "is the one of optimizer=...", "total_steps": LENGTH, "T_max": LENGTH},
-    "callbacks": {"run": "is the run folder, run=FOLDER"},
+    "callbacks": {"run": "is the run folder, run=FOLDER", "objective": "is that of the search, objective=[chamfer_sq]"},
     "logger": {"save_dir": "is the run folder, run=FOLDER"},
     "trainer": {
         "callbacks": "are a group of their own: callbacks=[default,ema], +callbacks.NAME._target_=CLASS",

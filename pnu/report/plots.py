@@ -82,8 +82,10 @@ def plots(study: Study) -> dict[str, Plot]:
     return found
 
 
-def plot(caption: str, drawn: Sequence[Panel], legend: Sequence[str] = (), columns: int = 3) -> Plot:
-    """Panels in rows, and below them a legend: number and color of each name."""
+def plot(
+    caption: str, drawn: Sequence[Panel], legend: Sequence[str] = (), columns: int = 3, scale: float = 1.0
+) -> Plot:
+    """Panels in rows, each `scale` times as large as usual, and below them a legend: number and color of each name."""
     with needed("drawing plots"):
         from matplotlib import style
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -95,9 +97,9 @@ def plot(caption: str, drawn: Sequence[Panel], legend: Sequence[str] = (), colum
     below = 0.22 * -(-len(legend) // across) + 0.1 if legend else 0.0
     with style.context(["default", {**STYLE, "svg.hashsalt": caption}]), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # of names in other scripts
-        figure = Figure(figsize=(columns * WIDTH, rows * HEIGHT + below))
+        figure = Figure(figsize=(columns * scale * WIDTH, rows * scale * HEIGHT + below))
         FigureCanvasAgg(figure)
-        share = below / (rows * HEIGHT + below)
+        share = below / (rows * scale * HEIGHT + below)
         figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.08, rect=(0, share, 1, 1 - share))
         axes = figure.subplots(rows, columns, squeeze=False).ravel()
         for panel, place in zip(drawn, axes, strict=False):

@@ -12,6 +12,7 @@ from pnu.io import atomic_path
 from pnu.report import offline_page
 from pnu.report.cloud_sheets import sheets
 from pnu.report.plots import Plot, plots
+from pnu.report.search_front import front_table, search_plots
 from pnu.report.sweep_results import Run, Setting, Study, short
 from pnu.runtime.provenance import provenance
 from pnu.training.sweeps import runs_elsewhere, state
@@ -26,7 +27,7 @@ COMPARED = (
 def write_report(study: Study, folder: Path) -> list[Path]:
     """Write report.md, report.html, summary.csv, runs.csv and the figures, each atomically; their paths."""
     folder.mkdir(parents=True, exist_ok=True)
-    drawn = plots(study)
+    drawn = search_plots(study) | plots(study)
     pictures = {shape: rendering.webp(picture, quality=80) for shape, picture in sheets(study).items()}
     contents: dict[str, bytes] = {
         "report.md": markdown(study, drawn, list(pictures)).encode(),
@@ -55,6 +56,8 @@ def facts(study: Study) -> list[str]:
     if study.baseline:
         lines.append(f"Baseline: {study.baseline.name}.")
     lines.append(provenance(counts, known["git"], known["machine"]))
+    if study.pruned:
+        lines.append(f"{len(study.pruned)} runs were pruned, see the end.")
     if study.unfinished:
         lines.append(f"{len(study.unfinished)} runs have not finished, see the end.")
     return lines
@@ -93,6 +96,11 @@ def differing(setting: Setting, baseline: Setting | None) -> str:
     return ", ".join(f"{key}={short(value)}" for key, value in found.items())
 
 
+def prunings(study: Study) -> list[str]:
+    """A line for each run that was pruned, with the reason."""
+    return [f"{run.folder.path.name}: {run.record.get('pruned', '')}" for run in study.pruned]
+
+
 def failures(study: Study) -> list[str]:
     """A line for each run that did not finish."""
     return [f"{run.folder.path.name}: {status(run)}" for run in study.unfinished]
@@ -125,12 +133,16 @@ def markdown(study: Study, drawn: Mapping[str, Plot], shapes: Sequence[str]) -> 
         cells = [f"**{text}**" if beyond else text for text, beyond in ((f"{m} {d}".strip(), b) for m, d, b in found)]
         differs = "baseline" if setting is study.baseline else differing(setting, study.baseline)
         lines.append(f"| {i} | {setting.name} | {' | '.join(cells)} | {differs} |")
+    if found_best := front_table(study):
+        lines += ["", "## Best validation of the trials that no other beats, and of several seeds", "", *found_best]
     for name, plot in drawn.items():
         lines += ["", f"## {plot.caption}", "", f"![{plot.caption}]({name}.svg)"]
     if shapes:
         lines += ["", "## The same validation clouds for each setting: input, prediction, target; colors are normals"]
     for shape in shapes:
         lines += ["", f"![{shape}](cloud_{shape}.webp)"]
+    if study.pruned:
+        lines += ["", "## Runs that were pruned", "", *(f"- {text}" for text in prunings(study))]
     if study.unfinished:
         lines += ["", "## Runs that have not finished", "", *(f"- {text}" for text in failures(study))]
     return "\n".join(lines) + "\n"
@@ -147,6 +159,7 @@ def page_html(study: Study, drawn: Mapping[str, Plot], pictures: Mapping[str, by
         settings=settings_table(study),
         plots=list(drawn.values()),
         pictures={shape: offline_page.data_url(picture) for shape, picture in pictures.items()},
+        prunings=prunings(study),
         failures=failures(study),
     )
 
@@ -178,13 +191,15 @@ def summary_rows(study: Study) -> list[dict[str, Any]]:
 
 
 def run_rows(study: Study) -> list[dict[str, Any]]:
-    """A row for each run, those that have not finished too."""
+    """A row for each run, those that were pruned or have not finished too."""
     named = [(setting.name, run) for setting in study.settings for run in setting.runs]
     rows = []
-    for name, run in [*named, *(("", run) for run in study.unfinished)]:
+    for name, run in [*named, *(("", run) for run in [*study.pruned, *study.unfinished])]:
         row = {"setting": name, "seed": run.seed, "status": run.record.get("status"), "run": run.folder.path.name}
         row |= {metric: run.metrics.get(metric) for metric in study.metrics}
-        rows.append(row | {"wall_s": run.record.get("wall_s"), "error": run.record.get("error")})
+        rows.append(
+            row | {"wall_s": run.record.get("wall_s"), "error": run.record.get("error") or run.record.get("pruned")}
+        )
     return rows
 
 

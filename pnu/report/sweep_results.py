@@ -22,12 +22,13 @@ REPEATED = ("seed", "data.seed")  # what may differ between the runs of one sett
 
 
 class Run(NamedTuple):
-    """One run folder; `metrics` are those of the test, empty unless it finished."""
+    """One run folder; `metrics` are those of the test, empty unless it finished, `validation` those of the best one."""
 
     folder: RunFolder
     record: Mapping[str, Any]
     config: Mapping[str, Any]  # dotted keys
     metrics: Mapping[str, float]
+    validation: Mapping[str, float]
 
     @property
     def seed(self) -> Any:
@@ -67,7 +68,8 @@ class Setting(NamedTuple):
 
 
 class Study(NamedTuple):
-    """All settings in the order of their jobs, the baseline first; and the runs that have not finished.
+    """All settings in the order of their jobs, the baseline first; the runs that have not finished, and those that
+    were pruned.
 
     search: whether the settings are trials of a search, of which none is the one to compare with.
     """
@@ -76,6 +78,7 @@ class Study(NamedTuple):
     settings: Sequence[Setting]
     unfinished: Sequence[Run]
     search: bool = False
+    pruned: Sequence[Run] = ()
 
     @property
     def baseline(self) -> Setting | None:
@@ -138,7 +141,8 @@ def collect(folder: str | Path, baseline: str | None = None) -> Study:
             raise ValueError(f"baseline={baseline}: expected one of {names}")
         settings = chosen + [setting for setting in settings if setting is not chosen[0]]
     search = baseline is None and any(run.config.get("objective") for run in finished)
-    return Study(folder, settings, [run for run in found if not run.metrics], search)
+    pruned = [run for run in found if run.record.get("status") == "pruned"]
+    return Study(folder, settings, [run for run in found if not run.metrics and run not in pruned], search, pruned)
 
 
 def read_run(folder: RunFolder) -> Run:
@@ -147,7 +151,8 @@ def read_run(folder: RunFolder) -> Run:
     config = yaml.safe_load(folder.config.read_text("utf-8")) if folder.config.exists() else {}
     flat = {key: value for key, value in flatten(config).items() if not isinstance(value, Mapping)}
     metrics = read_json(folder.metrics) if folder.metrics.exists() else {}
-    return Run(folder, record, flat, metrics.get("test", {}) if record.get("status") == "finished" else {})
+    test = metrics.get("test", {}) if record.get("status") == "finished" else {}
+    return Run(folder, record, flat, test, metrics.get("validation", {}))
 
 
 def grouped(found: Sequence[Run]) -> list[Setting]:

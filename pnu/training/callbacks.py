@@ -4,7 +4,7 @@ import itertools
 import math
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from pnu.networks.checkpoints import read_checkpoint, write_checkpoint
 from pnu.rendering import figure, look_at, render_cloud, save_png
 from pnu.rendering.colors import normal_colors
 from pnu.runtime.progress import bar
+from pnu.training.pruning import keep_values, objective_values, why_hopeless
 from pnu.training.run_folder import UNHASHED, UNHASHED_DATA, RunFolder
 
 with needed("training"):
@@ -197,6 +198,40 @@ class EMA(pl.Callback):
             value.copy_(self.average[name])
             self.average[name].copy_(kept)
         self.swapped = not self.swapped
+
+
+class Pruning(pl.Callback):
+    """Ends a trial of a search that is worse than the median of the sweep's other runs at the same step in all metrics
+    of the objective: the median stopping rule (Golovin et al. 2017, "Google Vizier"), with the trial's best values so
+    far as in Optuna's `MedianPruner`, and pruned runs among the others as far as they came.
+
+    The result of a pruned trial is its best validation. A run that is no job of a sweep is not pruned, nor is a job
+    that `resume=true` goes on with by itself. Runs of one sweep are compared by their step alone, so that they should
+    be of one length.
+
+    Args:
+        run: the run that may be pruned; its validations.json gets what is compared
+        objective: validation metrics that are compared
+        startup: other runs that must have got as far before one is pruned
+        warmup: steps before which none is pruned
+    """
+
+    def __init__(self, run: RunFolder, objective: Sequence[str] | None, startup: int = 5, warmup: int = 0) -> None:
+        if startup < 1 or warmup < 0:
+            raise ValueError("callbacks.pruning: expected startup >= 1 and warmup >= 0")
+        if not objective:
+            raise ValueError("callbacks.pruning: compares validation metrics; name them, as objective=[chamfer_sq]")
+        self.run, self.objective, self.startup, self.warmup = run, objective, startup, warmup
+
+    def on_validation_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if trainer.state.fn != "fit" or trainer.sanity_checking or "job" not in self.run.facts:
+            return
+        found = {name.removeprefix("val/"): float(value) for name, value in trainer.callback_metrics.items()}
+        step = trainer.global_step
+        keep_values(self.run, step, objective_values(self.objective, found))
+        if step >= self.warmup and not ends(trainer):
+            self.run.pruned = why_hopeless(self.run, step, self.objective, self.startup)
+            trainer.should_stop = trainer.should_stop or bool(self.run.pruned)
 
 
 class ProgressBar(pl.Callback):
@@ -406,7 +441,7 @@ def shown_normals(cloud: np.ndarray) -> np.ndarray:
     return normals
 
 
-KEEPERS = (Checkpoints, Pictures)
+KEEPERS = (Checkpoints, Pictures, Pruning)
 
 
 def build_all(config: Mapping[str, Any], run: RunFolder) -> list[pl.Callback]:
@@ -419,7 +454,8 @@ def build_all(config: Mapping[str, Any], run: RunFolder) -> list[pl.Callback]:
     for group in (config["callbacks"] or {}).values():
         if trainer.get("fast_dev_run") and find_class(group["_target_"], "pnu", ("lightning",)) in KEEPERS:
             continue
-        own = {"run": run} if "run" in (arguments(str(group["_target_"])) or {}) else {}
+        known = arguments(str(group["_target_"])) or {}
+        own = {n: v for n, v in {"run": run, "objective": config["objective"]}.items() if n in known}
         found.append(instantiate(group, PACKAGES["callbacks"], allow=config.get("allow") or (), **own))
     return sorted(found, key=lambda callback: (isinstance(callback, EMA), isinstance(callback, Checkpoints)))
 

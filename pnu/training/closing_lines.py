@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from pnu.io import read_json
+from pnu.training.pruning import objective_values
 from pnu.training.run_folder import RunFolder
 
 if TYPE_CHECKING:
@@ -24,10 +25,7 @@ def objective(config: Mapping[str, Any], run: RunFolder) -> list[float] | None:
     found = read_json(run.metrics).get("validation")
     if found is None:
         raise ValueError("objective: no validation during the training; lower trainer.val_check_interval")
-    missing = set(config["objective"]) - set(found)
-    if missing:
-        raise ValueError(f"objective={sorted(missing)}: expected some of {', '.join(sorted(set(found) - {'step'}))}")
-    return [found[name] for name in config["objective"]]
+    return list(objective_values(config["objective"], found).values())
 
 
 def own_metrics(run: RunFolder) -> dict[str, Any]:
@@ -47,7 +45,9 @@ def shown_in(results: Iterable[Mapping[str, Any]], own: Mapping[str, Any]) -> li
 
 
 def job_line(run: RunFolder) -> str:
-    """The test metrics of one job of a sweep."""
+    """The test metrics of one job of a sweep; of a pruned one, why it was."""
+    if run.pruned:
+        return f"job {run.facts['job']} pruned: {run}: {run.pruned}"
     test = read_json(run.metrics)["test"]
     parts = [f"{shown.title} {shown.text(test[shown.name])}" for shown in shown_in([test], own_metrics(run))]
     return f"job {run.facts['job']} finished: {run}: {', '.join(parts)}"

@@ -19,9 +19,12 @@ from pnu.config.quoting import shell_line, typed_line
 from pnu.io import atomic_path, read_json, write_json
 from pnu.runtime.provenance import git_revision
 
+# status of a job that a sweep started again leaves alone, and what is said of it
+ENDED = {"finished": "has finished before, skipped", "pruned": "was pruned before, skipped"}
 INTERRUPTED = 130  # exit code of a program that Ctrl-C ends
 PACKAGES = ("pnu", "torch", "lightning", "numpy", "scipy", "hydra-core")
-TRAINED = ("checkpoints", "tensorboard", "csv", "pictures", "metrics.json")  # what a training makes in its folder
+# what a training makes in its folder
+TRAINED = ("checkpoints", "tensorboard", "csv", "pictures", "metrics.json", "validations.json")
 # keys that change where or how a run is told about, not what it computes
 UNHASHED = ("run", "resume", "name", "quiet", "logger", "sweep", "objective", "metrics", "allow")
 UNHASHED_DATA = ("quiet", "workers", "cache")
@@ -36,11 +39,13 @@ class RunFolder:
         self.last = self.path / "checkpoints" / "last.ckpt"
         self.best = self.path / "checkpoints" / "best.ckpt"
         self.metrics = self.path / "metrics.json"
+        self.validations = self.path / "validations.json"
         self.pictures = self.path / "pictures"
         self.record_path = self.path / "run.json"
         self.facts: dict[str, Any] = {}  # more that run.json shall tell
         self.allow: list[str] = []  # packages whose classes its config names
         self.skip = ""  # why nothing is to be done
+        self.pruned = ""  # why its training was ended early
         self.lock: int | None = None  # descriptor of a lock, closed when the run ends
 
     def __str__(self) -> str:
@@ -118,7 +123,8 @@ class RunFolder:
 
     @contextmanager
     def recorded(self, config: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-        """run.json tells the state of what runs inside: running at once, then finished, or failed with the error.
+        """run.json tells the state of what runs inside: running at once, then finished, pruned with the reason, or
+        failed with the error.
 
         Gives the record; what the block adds to it is written at the end.
         """
@@ -146,7 +152,7 @@ class RunFolder:
         write_json(self.record_path, record)
         try:
             yield record
-            record["status"] = "finished"
+            record |= {"status": "pruned", "pruned": self.pruned} if self.pruned else {"status": "finished"}
         except (KeyboardInterrupt, SystemExit):  # Lightning turns the first into the second
             record |= {"status": "failed", "error": "interrupted"}
             if "job" not in self.facts:  # a sweep tells at its end

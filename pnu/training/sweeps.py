@@ -3,8 +3,8 @@
     outputs/sweeps/<sweep>/multirun.yaml                 what was swept, by Hydra
                            <what differs>_<hash>/        a run folder for each job; the hash is that of its config
 
-A job whose folder tells that it finished, or that another process runs, is skipped; one that was interrupted goes on
-from its last checkpoint, or starts again where it has none.
+A job whose folder tells that it finished or was pruned, or that another process runs, is skipped; one that was
+interrupted goes on from its last checkpoint, or starts again where it has none.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ from typing import Any, TextIO, cast
 from pnu.config.compose import one_line, parse, variations
 from pnu.config.quoting import shell_line, typed_line
 from pnu.io import read_json, remove_leftovers, write_json
-from pnu.training.run_folder import INTERRUPTED, RunFolder, config_hash, now
+from pnu.training.run_folder import ENDED, INTERRUPTED, RunFolder, config_hash, now
 
 UNNAMED = ("sweep", "quiet")  # keys that do not make another sweep
 
@@ -90,8 +90,7 @@ def job_folder(config: Mapping[str, Any]) -> RunFolder:
         folder.skip = "another process runs it, left alone"
         return folder
     remove_leftovers(folder.path)
-    if folder.read_record().get("status") == "finished":
-        folder.skip = "has finished before, skipped"
+    folder.skip = ENDED.get(folder.read_record().get("status", ""), "")
     if not folder.skip and not folder.last.exists():  # nothing to go on from
         folder.start_anew()
     choices = hydra.runtime.choices
@@ -205,7 +204,7 @@ def run(start: Callable[[], None], folder: Path) -> None:
     if code == INTERRUPTED:
         print(f"stopped; go on with: {typed_line()}", file=sys.stderr, flush=True)
     ended = [run for run in runs(folder) if run.record_path.stat().st_mtime > began]
-    broken = [run for run in ended if run.read_record().get("status") != "finished" and not runs_elsewhere(run)]
+    broken = [run for run in ended if run.read_record().get("status") not in ENDED and not runs_elsewhere(run)]
     if code or broken:  # Optuna goes on without them
         sys.exit(code or 1)
 
@@ -222,8 +221,8 @@ def record_interruptions(folder: Path, patience: float = 10) -> None:
 
 
 def state(run: RunFolder) -> str:
-    """How a run's record ends: finished, failed, interrupted, running; "interrupted" too where the process of a record
-    that says "running" is gone."""
+    """How a run's record ends: finished, pruned, failed, interrupted, running; "interrupted" too where the process of a
+    record that says "running" is gone."""
     record = run.read_record()
     status = str(record.get("status", "no record"))
     if record.get("error") == "interrupted":

@@ -27,6 +27,7 @@ from pnu.report import sweep_report
 from pnu.report.comparison_tables import tables
 from pnu.report.offline_page import write_page
 from pnu.report.plots import front, logarithmic, mean_curve, plots
+from pnu.report.search_front import search_plots, trials, unbeaten
 from pnu.report.sweep_report import differing, write_report
 from pnu.report.sweep_results import Setting, collect, effects
 from tests.chromium import CHROMIUM, needs_browser
@@ -170,6 +171,55 @@ def test_a_search_has_no_baseline(make: Make, capsys: pytest.CaptureFixture[str]
     assert "3 trials of a search, 1 seeds each" in text
     assert "| 0 | loss.w3=0.5 | 300.0000 | 27.00 | loss.w3=0.5 |" in text
     assert collect(folder, "loss.w3=0.1").baseline is not None
+
+
+def trial(make: Make, job: int, seed: int, place: tuple[float, float], status: str = "finished", **loss: float) -> Path:
+    """A run of a search for two objectives: those of its best validation."""
+    folder = make(job, None, seed, 0.1, **loss)
+    path = folder / f"{job}"
+    config = yaml.safe_load((path / "config.yaml").read_text())
+    (path / "config.yaml").write_text(yaml.safe_dump(config | {"objective": ["chamfer_sq", "normal_deg"]}))
+    validation = dict(zip(["chamfer_sq", "normal_deg"], place, strict=True))
+    found = {"test": {"chamfer_sq": 0.1, "normal_deg": 9.0}, "validation": validation}
+    (path / "metrics.json").write_text(json.dumps(found))
+    if status == "pruned":
+        record = json.loads((path / "run.json").read_text())
+        (path / "run.json").write_text(json.dumps(record | {"status": status, "pruned": "step 9: worse"}))
+        (path / "metrics.json").write_text(json.dumps({"validation": validation}))
+    return folder
+
+
+def test_front_of_a_search_by_hand(make: Make) -> None:
+    """Two trials that no other beats, one that is beaten, one pruned; the weights beside them, thrice."""
+    for job, place in enumerate([(0.1, 30.0), (0.2, 20.0), (0.3, 25.0)]):
+        trial(make, job, 0, place, w3=0.5 + job)
+    trial(make, 3, 0, (0.5, 60.0), "pruned", w3=7.0)
+    for seed, place in enumerate([(0.1, 10.0), (0.2, 14.0), (0.3, 12.0)]):
+        folder = trial(make, 4 + seed, seed, place)
+    study = collect(folder)
+    assert [(t.number, len(t.places)) for t in trials(study)] == [(0, 1), (1, 1), (2, 1), (3, 3), (None, 1)]
+    assert [t.number for t in unbeaten(trials(study))] == [0, 1]
+    assert study.unfinished == []
+    drawn = search_plots(study)
+    text = sweep_report.markdown(study, drawn, [])
+    for line in (
+        "| 0 | 100.0000 | 30.00 | 1 | loss.w3=0.5 |",
+        "| 1 | 200.0000 | 20.00 | 1 | loss.w3=1.5 |",
+        "| 3 | 200.0000 ± 100.0000 | 12.00 ± 2.00 | 3 | loss.w3=0.05 |",
+        "- 3: step 9: worse",
+    ):
+        assert f"{line}\n" in text
+    assert "| 2 | 300.0000" not in text.split("## ")[1]
+    assert "1 runs were pruned, see the end." in text
+    assert "<li>3: step 9: worse</li>" in sweep_report.page_html(study, drawn, {})
+    for label in ("1 pruned", "3 to the end", "3, 3 seeds"):
+        assert label in drawn["search"].svg
+    (row,) = (row for row in sweep_report.run_rows(study) if row["status"] == "pruned")
+    assert (row["run"], row["error"]) == ("3", "step 9: worse")
+
+
+def test_no_front_without_two_objectives(make: Make) -> None:
+    assert search_plots(collect(make(0, "default", 0, 0.1))) == {}
 
 
 def test_terms_left_out_are_no_effect_of_a_number(make: Make) -> None:
