@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 FOLDER = Path(__file__).parent
 SUFFIX = ".safetensors"
-RIVALS = ("ecnet", "pugan", "pugeo", "punet")  # in the repository alone: 10 MB that no wheel carries
+RIVALS = ("ecnet", "pnu_residual", "pugan", "pugeo", "punet")  # in the repository alone: 16 MB that no wheel carries
 
 
 class Weights(NamedTuple):
