@@ -309,7 +309,8 @@ def test_faults_of_a_container_are_found(line: str, faulty: str, fault: str) -> 
 def test_make_leaves_the_system_alone_if_asked() -> None:
     def steps(*given: str) -> str:
         command = ["make", "--dry-run", "--always-make", "setup", f"PYTHON={sys.executable}", *given]
-        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        outside = {name: value for name, value in os.environ.items() if name not in ("MAKEFLAGS", "MFLAGS", "SYSTEM")}
+        return subprocess.run(command, cwd=ROOT, env=outside, capture_output=True, text=True, check=True).stdout
 
     assert "doctor --install --no-system" in steps("SYSTEM=no")
     assert "--no-system" not in steps()
