@@ -46,6 +46,8 @@ def _alike(sides: Floats, normals: Floats) -> Floats:
 
 
 def _unit(vectors: Floats) -> Floats:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    unit: Floats = np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
+    """Of length 1, or 0 where there is no direction: zero, NaN or infinite."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    unit: Floats = np.divide(vectors, length, out=np.zeros_like(vectors), where=(length > 0) & np.isfinite(length))
     return unit

@@ -46,9 +46,15 @@ def test_motion_and_order_of_the_predictions_change_nothing() -> None:
     np.testing.assert_allclose(agreed(moved[:50], moved)[:, :3], found[:, :3] @ turn + [1, 2, 3], atol=1e-9)
 
 
-def test_predictions_without_a_direction_move_nothing() -> None:
-    predicted = plates(30, 0.004)
-    predicted[:, 3:] = 0
+@pytest.mark.parametrize("lost", [0, np.nan, np.inf])
+def test_predictions_without_a_direction_move_nothing(lost: float) -> None:
+    predicted = plates(500, 0.004)
+    predicted[:100, 3:] = lost
+    found = agreed(predicted, predicted)
+    assert np.isfinite(found).all()
+    assert np.array_equal(found[:100, :3], predicted[:100, :3])
+    assert (np.linalg.norm(found[100:, 3:], axis=1) > 0.999).all()
+    predicted[:, 3:] = lost
     assert np.array_equal(agreed(predicted, predicted)[:, :3], predicted[:, :3])
 
 
