@@ -121,6 +121,8 @@ def network_upsampler(
             f"ratio={ratio:g}: {name} was trained for {trained}; give ratio={trained}, or passes=true to "
             f"reach {ratio:g} by passes and farthest points"
         )
+    if not patches:  # what is compared beside networks of patches has none to merge
+        options.pop("merge", None)
     kept: Any = {"true": True, "false": False}.get(str(keep).lower(), keep)
     if kept is True and not isinstance(model, str) and not getattr(upsamplers.upsampler_of(model), "follows", False):
         raise ValueError(f"keep=true: {name} spreads all points anew; give it to surface alone")

@@ -67,6 +67,7 @@ def check_tiles(cfg: Any) -> None:
         "removed": None,
         "sample": None,
         "patch_size": None,
+        "merge": "farthest",
         "devices": 1,
         "allow": [],
     }

@@ -44,7 +44,7 @@ class Patches:
         ValueError: the network has no ratio.
     """
 
-    parallel = True
+    parallel = merges = True
 
     def __init__(self, network: nn.Module, patch_size: int | None = None) -> None:
         self.network = network

@@ -211,6 +211,8 @@ def upsample(
     upsampler = upsampler_of(network, patch_size)
     if devices > 1 and not getattr(upsampler, "parallel", False):
         raise ValueError(f"devices={devices}: {type(network).__name__} works in one process; leave devices=1")
+    if merge == "agreed" and not getattr(upsampler, "merges", False):
+        raise ValueError(f"merge=agreed: {type(network).__name__} has no patches that overlap; leave it out")
     names = _names(target, devices)
     sparse, frame = _prepare(given, progress, estimated, refine=not getattr(network, "passes", 0))
     if not getattr(upsampler, "follows", False) and (density == "follow" or keep is True):

@@ -112,6 +112,7 @@ BAD = {
     "memory=much": "memory=much: expected a size such as 4GiB or 1500MiB",
     "memory=100MiB": "memory=100MiB: is too little for this ratio; expected at least ",
     "memory=4GiB holes=1": "holes=1.0: takes the cloud as a whole; leave it out, or memory= and tiles=",
+    "memory=4GiB merge=agreed": "merge=agreed: takes the cloud as a whole; leave it out, or memory= and tiles=",
     "memory=4GiB devices=2": "devices=2: takes the cloud as a whole; leave it out, or memory= and tiles=",
     "memory=4GiB run=apss": "run=apss: takes the cloud as a whole, without memory= and tiles=; surface takes tiles",
     "memory=4GiB output=a.xyz": "a.xyz: .xyz is not written in parts, as memory= and tiles= want it; take one of",

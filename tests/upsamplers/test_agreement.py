@@ -93,3 +93,8 @@ def test_orientations_of_patches_take_away_what_a_network_does_in_one() -> None:
 def test_another_merge_is_refused() -> None:
     with pytest.raises(ValueError, match="merge=mean: expected farthest or agreed"):
         pnu.upsample(plates(20, 0), merge="mean")
+
+
+def test_what_has_no_patches_refuses_to_merge_them() -> None:
+    with pytest.raises(ValueError, match="merge=agreed: .* has no patches that overlap; leave it out"):
+        pnu.upsample(plates(50, 0), model="midpoint", merge="agreed")
