@@ -104,7 +104,7 @@ class Surface(nn.Module):
 
     def __init__(
         self, ratio: int = 4, neighbors: int = 24, reach: int = 24, width: int = 64, rounds: int = 2,
-        seeds: float = 4, candidates: float = 2, shortlist: float = 1.15,
+        seeds: float = 4, candidates: float = 3, shortlist: float = 2,
         relaxation: int = 2, refinements: int = 2, reject: float = 0.003, slide: float = 1.0,
         queries: int = 64, smoothing: float = 0.0, refining: float = 0.0, passes: int = 0,
         sphere: bool = True, attention: bool = True,

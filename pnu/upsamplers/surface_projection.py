@@ -50,6 +50,7 @@ LONG = 10_000  # points made from which on a computation takes long enough to ha
 SPACED = 6  # neighbors whose mean distance is the spacing at a point of the cloud,
 COVERED = 0.5  # of which so much may lie between it and the nearest point made;
 NEARER, APPROACHES = 0.9, 3  # that comes to this share of it, again where another lost its own
+OF_PART = 2, 1.15  # candidates and shortlist of a part, at most: of more, too many at its borders would stay
 CLOSE = 12  # neighbors of the sphere that candidates are first moved to
 
 
@@ -92,14 +93,17 @@ class SurfaceProjection:
             others = np.setdiff1d(np.arange(len(cloud)), rows)
             kept = measured[rows] if context.keep else measured[:0]
             named = partial(_named, context.progress, f"density {number + 1}, ")
-            part = replace(context, progress=named, parts=context.parts.within(f"density_{number + 1}"))
-            found.append(self.spread(cloud[np.concatenate([rows, others])], kept, len(rows), some, part))
+            of_group = replace(context, progress=named, parts=context.parts.within(f"density_{number + 1}"))
+            found.append(self.spread(cloud[np.concatenate([rows, others])], kept, len(rows), some, of_group, part=True))
         return np.concatenate(found)
 
-    def spread(self, cloud: Floats, kept: Floats, first: int, count: int, context: Context) -> Floats:
+    def spread(
+        self, cloud: Floats, kept: Floats, first: int, count: int, context: Context, *, part: bool = False
+    ) -> Floats:
         """Evenly spread points (count, 6) where the first points of a cloud (n, 6) are the nearest of its points.
 
         Those that are `kept` (k, 6) come first, as they are but for their normals; others fill the places between.
+        With `part` the cloud goes on at its borders, where others make points.
         """
         network, in_process = self.network, InProcess(self.network)
         new = count - len(kept)
@@ -111,9 +115,10 @@ class SurfaceProjection:
             return context.parts.get(name, lambda: compute(partial(context.progress, name)))
 
         each = max(1, round(network.seeds * new / first))
-        candidates, some, more = (
-            round(share * new) for share in (network.candidates, network.shortlist, 1 + network.reject)
-        )
+        chosen_from = network.candidates, network.shortlist
+        if part:
+            chosen_from = min(chosen_from[0], OF_PART[0]), min(chosen_from[1], OF_PART[1])
+        candidates, some, more = (round(share * new) for share in (*chosen_from, 1 + network.reject))
         query = named("seeds", lambda step: seeds_around(cloud, each, candidates, step, first=first))
         if starts_on_spheres(network):
             to_sphere = partial(spheres, batch_size=context.batch_size)

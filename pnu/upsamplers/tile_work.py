@@ -288,7 +288,7 @@ def made(plan: Plan, number: int, whole: Whole, upsampler: SurfaceProjection, pr
         others = np.setdiff1d(np.arange(len(cloud)), group)
         fixed = measured[group] if facts.keep else measured[:0]
         order = np.concatenate([group, others])
-        raw = upsampler.spread(smooth[order], fixed, len(group), max(count, len(fixed)), context)
+        raw = upsampler.spread(smooth[order], fixed, len(group), max(count, len(fixed)), context, part=True)
         dense = frame.from_unit(with_unit_normals(raw, smooth))
         if facts.keep:
             dense[: len(group), :3] = rows["point"][group]
