@@ -39,6 +39,7 @@ Index = NDArray[np.int64]
 CloudT = TypeVar("CloudT", "Floats", "Tensor")
 
 EVEN = 0.3  # standard deviation over mean of the nearest distance; 0.52 at random
+STILL_EVEN = 0.4  # so much where points were smoothed
 SMOOTH = 0.1  # noise in spacings from which on a cloud is smoothed first
 KEPT = 2**19  # queries whose projections are kept in one file
 BATCH = 512  # queries at once on a CPU,
@@ -70,7 +71,8 @@ class SurfaceProjection:
     def upsample_cloud(self, cloud: CloudT, count: int, context: Context) -> CloudT:
         """cloud (n, 6) -> (count, 6) with unit normals, an array or a tensor.
 
-        The points of a cloud that is noisy beside their spacing are themselves projected first.
+        The points of a cloud that is noisy beside their spacing are themselves projected first. Where they then lie
+        evenly, new ones come between them, and they stay: so a place that was measured does not lie bare.
         """
         if not isinstance(cloud, np.ndarray):
             import torch
@@ -82,12 +84,13 @@ class SurfaceProjection:
         cloud = self.with_refined_normals(cloud, self.network.passes, context)
         if noise_in_spacings(cloud) > SMOOTH:
             measured, cloud = cloud, self.smoothed(cloud, context)
+            staying = cloud if count > len(cloud) and is_even(cloud, STILL_EVEN) else cloud[:0]
         else:
-            measured = cloud
+            measured, staying = cloud, cloud[:0]
         places = cloud[:, :3]
         counts = point_counts(places, count, context.density)
         if counts is None:
-            return self.spread(cloud, cloud[:0] if not context.keep else measured, len(cloud), count, context)
+            return self.spread(cloud, measured if context.keep else staying, len(cloud), count, context)
         found = []
         for number, (rows, some) in enumerate(groups_of_like_spacing(places, counts, count)):
             others = np.setdiff1d(np.arange(len(cloud)), rows)
@@ -274,10 +277,15 @@ def noise_in_spacings(cloud: Floats) -> float:
     return noise_level(cloud[:, :3], cloud[:, 3:]) / spacing(cloud[:, :3])
 
 
-def is_clean_and_even(cloud: Floats) -> bool:
-    """Whether the points of a cloud (n, 6) are evenly spread, as farthest points are, and show no noise."""
+def is_even(cloud: Floats, limit: float = EVEN) -> bool:
+    """Whether the points of a cloud (n, 6) are evenly spread, as farthest points are: their spacing varies by less."""
     apart = PointTree(cloud[:, :3]).among_themselves(2, threads=threads.thread_count())[0][:, 0]
-    return bool(apart.std(ddof=1) < EVEN * apart.mean()) and noise_in_spacings(cloud) < FAINT
+    return bool(apart.std(ddof=1) < limit * apart.mean())
+
+
+def is_clean_and_even(cloud: Floats) -> bool:
+    """Whether the points of a cloud (n, 6) are evenly spread and show no noise."""
+    return is_even(cloud) and noise_in_spacings(cloud) < FAINT
 
 
 def seeds_around(cloud: Floats, each: int, count: int, step: Step = silent, *, first: int | None = None) -> Floats:

@@ -337,7 +337,8 @@ def test_a_fast_part_equals_the_plain_one(name: str, clouds: int, n: int, mode: 
         fast = accelerate(copy.deepcopy(part))
         assert type(fast) is FORMS[type(part)]
         found = values_of(fast, lambda network: run(network, x), x)
-    assert_equal(found, expected, 1e-9 if dtype == torch.float64 else 2e-3 if mode == "training" else 1e-4)
+    # in float32 batch norm magnifies the rounding of columns that hardly vary, on each processor in another way
+    assert_equal(found, expected, 1e-9 if dtype == torch.float64 else 2e-2 if mode == "training" else 1e-4)
 
 
 NETWORKS = {

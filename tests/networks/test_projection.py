@@ -8,10 +8,13 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pnu.data.shapes import make, unit_mesh
 from pnu.geometry.even_spacing import repel, tangent_discs
 from pnu.geometry.local_frames import feet, local_frames, tangent_basis
+from pnu.geometry.mesh_sampling import sample_poisson_disk
 from pnu.geometry.spacing import spacing
 from pnu.geometry.transforms import rotation_matrix
+from pnu.metrics.functional import uniformity
 from pnu.networks.surface import Projector, Surface
 from pnu.upsamplers import Context, SurfaceProjection
 from pnu.upsamplers import surface_projection as procedure
@@ -338,6 +341,30 @@ def test_noisy_points_are_smoothed_first() -> None:
         stages |= seen
         assert float((dense[:, :3].norm(dim=1) - 1).abs().mean()) < max(0.5 * noise, 0.002)
     assert {"projection", "refinement 1", "refinement 2"} <= stages
+
+
+def test_noisy_points_that_lie_evenly_stay_where_they_are_smoothed() -> None:
+    """So that no place that was measured lies bare; random points would leave the result uneven."""
+    model, noise = Surface(), torch.randn(400, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    for even in (True, False):
+        cloud = sphere(4000)
+        cloud = cloud[procedure.farthest_points_large(cloud[:, :3].numpy(), 400)] if even else cloud[:400]
+        cloud[:, :3] += 0.03 * noise
+        context = Context()
+        smooth = SurfaceProjection(model).smoothed(cloud.numpy(), context)
+        dense = upsample(model, cloud, 1600).numpy()
+        stay = cKDTree(dense[:, :3]).query(smooth[:, :3])[0] < 1e-9
+        assert stay.all() if even else not stay.any()
+        np.testing.assert_allclose(np.linalg.norm(dense[:, 3:], axis=1), 1)
+        assert upsample(model, cloud, 200).shape == (200, 6)  # fewer than there are
+
+
+def test_bent_and_thin_parts_get_as_many_points_for_their_surface_as_flat_ones() -> None:
+    """Seeds around points of a limb stand off it, where they take more room: with few to choose from it is .075."""
+    mesh, random = unit_mesh(make("person")), np.random.default_rng(0)
+    cloud, truth = torch.from_numpy(sample_poisson_disk(mesh, 800, random)), sample_poisson_disk(mesh, 6000, random)
+    dense = upsample(Surface(), cloud, 3200, keep=True)
+    assert float(uniformity(dense[:, :3], truth[:, :3], share=0.03)) < 0.06
 
 
 @pytest.mark.parametrize("name", ["rounds", "seeds", "candidates", "shortlist", "refinements"])
