@@ -82,8 +82,8 @@ class Surface(nn.Module):
         width: of the network
         rounds: projections in training; at work there are 1 + refinements
         seeds: seeds for each point wanted
-        candidates: of them, after thinning out to even spacing; each moves to a sphere
-        shortlist: of those, thinned out again after they moved; the network projects these, the farthest stay
+        candidates: of them, after thinning out to even spacing (no input points stay: 2 at most); each moves to a sphere
+        shortlist: of those, thinned out again after they moved (1.15 at most there); the network projects these
         relaxation: steps of even spacing; 0: none
         refinements: projections after the even spacing; one more is nearer to the surface and a little less even
         reject: share of points made too many; the worst of their surroundings by expected error are dropped

@@ -51,7 +51,7 @@ LONG = 10_000  # points made from which on a computation takes long enough to ha
 SPACED = 6  # neighbors whose mean distance is the spacing at a point of the cloud,
 COVERED = 0.5  # of which so much may lie between it and the nearest point made;
 NEARER, APPROACHES = 0.9, 3  # that comes to this share of it, again where another lost its own
-OF_PART = 2, 1.15  # candidates and shortlist of a part, at most: of more, too many at its borders would stay
+FEW = 2, 1.15  # candidates and shortlist, at most, where no points stay that others have to fit, or others go on
 CLOSE = 12  # neighbors of the sphere that candidates are first moved to
 
 
@@ -119,8 +119,8 @@ class SurfaceProjection:
 
         each = max(1, round(network.seeds * new / first))
         chosen_from = network.candidates, network.shortlist
-        if part:
-            chosen_from = min(chosen_from[0], OF_PART[0]), min(chosen_from[1], OF_PART[1])
+        if part or not len(kept):
+            chosen_from = min(chosen_from[0], FEW[0]), min(chosen_from[1], FEW[1])
         candidates, some, more = (round(share * new) for share in (*chosen_from, 1 + network.reject))
         query = named("seeds", lambda step: seeds_around(cloud, each, candidates, step, first=first))
         if starts_on_spheres(network):
