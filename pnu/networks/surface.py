@@ -82,7 +82,7 @@ class Surface(nn.Module):
         width: of the network
         rounds: projections in training; at work there are 1 + refinements
         seeds: seeds for each point wanted
-        candidates: of them, after thinning out to even spacing (no input points stay: 2 at most); each moves to a sphere
+        candidates: of them, after thinning out evenly (no input points stay: 2 at most); each moves to a sphere
         shortlist: of those, thinned out again after they moved (1.15 at most there); the network projects these
         relaxation: steps of even spacing; 0: none
         refinements: projections after the even spacing; one more is nearer to the surface and a little less even
