@@ -51,7 +51,7 @@ LONG = 10_000  # points made from which on a computation takes long enough to ha
 SPACED = 6  # neighbors whose mean distance is the spacing at a point of the cloud,
 COVERED = 0.5  # of which so much may lie between it and the nearest point made;
 NEARER, APPROACHES = 0.9, 3  # that comes to this share of it, again where another lost its own
-FEW = 2, 1.15  # candidates and shortlist, at most, where no points stay that others have to fit, or others go on
+FEW = 2, 1.15  # candidates and shortlist, at most, where no points stay, or where the surface goes on beyond a part
 CLOSE = 12  # neighbors of the sphere that candidates are first moved to
 
 

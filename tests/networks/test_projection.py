@@ -350,8 +350,7 @@ def test_noisy_points_that_lie_evenly_stay_where_they_are_smoothed() -> None:
         cloud = sphere(4000)
         cloud = cloud[procedure.farthest_points_large(cloud[:, :3].numpy(), 400)] if even else cloud[:400]
         cloud[:, :3] += 0.03 * noise
-        context = Context()
-        smooth = SurfaceProjection(model).smoothed(cloud.numpy(), context)
+        smooth = SurfaceProjection(model).smoothed(cloud.numpy(), Context())
         dense = upsample(model, cloud, 1600).numpy()
         stay = cKDTree(dense[:, :3]).query(smooth[:, :3])[0] < 1e-9
         assert stay.all() if even else not stay.any()
