@@ -32,12 +32,14 @@ import pnu
 from bench.ops import full_matrix, plain_ball_query, plain_farthest_points
 from bench.step import data, step
 from bench.timing import Row, compare
+from pnu.fast import accelerate
 from pnu.geometry.neighbor_search import ball_query, gpu_kernels, knn
 from pnu.geometry.sampling import farthest_points
 from pnu.io import atomic_path
 from pnu.losses import CompoundLoss
 from pnu.networks.pnu import PNU
 from pnu.runtime.provenance import provenance
+from pnu.runtime.threads import processor_count
 
 EPOCH_STEPS = 200  # of the paper: 4000 patches in batches of 20
 
@@ -100,7 +102,9 @@ def step_lines(plan: Plan) -> Iterator[str]:
     if plan.small:
         inputs, target = inputs[:2, :64].contiguous(), target[:2, :256].contiguous()
     batch = (inputs.to(plan.device), target.to(plan.device))
-    networks: dict[str, Callable[[], object]] = {}
+    networks: dict[str, Callable[[], object]] = {
+        "float32, plain modules": training(plan, batch, "highest", None, fast=False)
+    }
     for name, precision, dtype in (
         ("float32", "highest", None),
         ("TF32", "high", None),
@@ -109,6 +113,7 @@ def step_lines(plan: Plan) -> Iterator[str]:
         networks[name] = training(plan, batch, precision, dtype)
     if plan.device.type == "cuda":
         networks["TF32, a graph"] = captured(networks["TF32"])
+        networks["TF32, plain modules, a graph"] = captured(training(plan, batch, "high", None, fast=False))
     row = plan.compare(f"training step, {len(inputs)} x {inputs.shape[1]} -> {target.shape[1]}", networks)
     torch.set_float32_matmul_precision("highest")
     for name, seconds in row.seconds.items():
@@ -122,13 +127,16 @@ def step_lines(plan: Plan) -> Iterator[str]:
 
 
 def training(
-    plan: Plan, batch: tuple[Tensor, Tensor], precision: str, dtype: torch.dtype | None
+    plan: Plan, batch: tuple[Tensor, Tensor], precision: str, dtype: torch.dtype | None, *, fast: bool = True
 ) -> Callable[[], object]:
-    """A step of a network of its own; `dtype` of autocast, with the loss in float32 as in training."""
+    """A step of a network of its own; `dtype` of autocast, with the loss in float32 as in training. `fast`: with the
+    kernels of `pnu.fast`, as `pnu train` has them."""
     torch.manual_seed(0)
     network, loss = PNU().to(plan.device), CompoundLoss().to(plan.device)
-    capturable = plan.device.type == "cuda"
-    optimizer = torch.optim.Adam(network.parameters(), 1e-3, weight_decay=1e-5, capturable=capturable)
+    if fast:
+        network, loss = accelerate(network), accelerate(loss)
+    on_gpu = plan.device.type == "cuda"
+    optimizer = torch.optim.Adam(network.parameters(), 1e-3, weight_decay=1e-5, capturable=on_gpu, fused=on_gpu)
 
     def forward(inputs: Tensor) -> Tensor:
         with torch.autocast(plan.device.type, dtype) if dtype else nullcontext():
@@ -178,12 +186,13 @@ def schedule_lines(plan: Plan) -> Iterator[str]:
     length = time.strftime("00:%H:%M:%S", time.gmtime(seconds))
     arguments = [f"run={run}", f"trainer.max_time={length}", "quiet=true"]
     if not (run / "config.yaml").exists():
-        arguments += ["scheduler=onecycle", "trainer.max_epochs=-1", "data.on_device=true"]
+        workers = max(1, processor_count() - 2)  # with many, samples are cut as fast as the GPU wants them
+        arguments += ["scheduler=onecycle", "trainer.max_epochs=-1", f"data.on_device={str(workers < 8).lower()}"]
         arguments += ["scale=small", "data.patches=100"] if plan.small else ["scale=full", "data.patches=4000"]
         if plan.device.type == "cuda":
             arguments += [
                 "trainer=gpu",
-                "data.workers=4",
+                f"data.workers={workers}",
                 "callbacks=[default,cuda_graph]",
                 "callbacks.cuda_graph.tf32=true",
             ]

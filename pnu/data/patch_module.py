@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Subset
 
@@ -56,6 +57,7 @@ class EpochDataModule(pl.LightningDataModule):
         self.evaluation_batch_size = batch_size
         self.resumed = 0, 1  # batches done, batches of an epoch
         self.datasets: dict[str, Dataset[Any]] = {}
+        self.copies: torch.cuda.Stream | None = None
 
     @property
     def process(self) -> tuple[int, int]:
@@ -107,6 +109,21 @@ class EpochDataModule(pl.LightningDataModule):
             data, batch_size, num_workers=self.workers, multiprocessing_context=context,
             persistent_workers=self.workers > 0, **options,
         )  # fmt: skip
+
+    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+        """On a GPU beside what it still has to do: a copy waits for its own stream, and so would this process."""
+        if device.type != "cuda":
+            return super().transfer_batch_to_device(batch, device, dataloader_idx)
+        if self.copies is None:
+            self.copies = torch.cuda.Stream(device)
+        now = torch.cuda.current_stream(device)
+        with torch.cuda.stream(self.copies):
+            moved = super().transfer_batch_to_device(batch, device, dataloader_idx)
+        now.wait_stream(self.copies)
+        for value in moved.values():
+            if isinstance(value, Tensor):
+                value.record_stream(now)  # its memory may be used again only after that
+        return moved
 
     def state_dict(self) -> dict[str, Any]:
         """Batches, not steps: several may make one step."""

@@ -1,7 +1,8 @@
 """Fast forms of the parts of `pnu.networks`. Each is a subclass that replaces `forward`.
 
 On the CPU layers run chunk by chunk (`stack`). A first layer, which is linear, multiplies before its input is gathered,
-interpolated or repeated: once a point, not once a neighbor or copy.
+interpolated or repeated: once a point, not once a neighbor or copy. A GPU has products to spare: there batch norm, ReLU
+and the maximum over neighbors are kernels of their own (`norm_kernels`).
 """
 
 from collections.abc import Sequence
@@ -12,10 +13,12 @@ from torch import Tensor, nn
 
 from pnu.fast import stack
 from pnu.fast.combine import combine
+from pnu.fast.gpu import kernels
 from pnu.fast.neighborhoods import Neighborhoods, distinct, pool, single, whole
 from pnu.geometry.neighbor_features import gather
 from pnu.geometry.neighbor_search import ball_query, knn
 from pnu.networks import layers, pugeo
+from pnu.networks.norm import check_rows
 
 
 def streamed(x: Tensor, training: bool) -> bool:
@@ -47,15 +50,33 @@ def through(
         if groups is not None and centers is not None:
             rows = combine(rows, groups.source[:, None]) - centers[groups.owner]
         for i, layer in enumerate(layers_of(mlp)):
-            rows = from_products(layer, rows) if projected and i == 0 else layer(rows)
+            rows = normed(layer, rows) if projected and i == 0 else layer(rows)
         rows = rows if groups is None else pool(rows, groups)
     return rows if groups is not None else rows.view(*x.shape[:-1], rows.shape[-1])
 
 
-def from_products(layer: layers.Layer, products: Tensor) -> Tensor:
-    """A layer from the products of its input (R, C) with its weight, without bias."""
-    rows: Tensor = layer.norm(products if layer.linear.bias is None else products + layer.linear.bias)
-    return rows.relu()
+def normed(layer: layers.Layer, products: Tensor, size: int | None = None) -> Tensor:
+    """A layer from the products of its input with its weight, without bias: rows (R, C) -> (R, C).
+
+    size: with it the maximum over each group of so many rows, (R / size, C).
+    """
+    norm, bias = layer.norm, layer.linear.bias
+    fused = kernels("norm_kernels", products) if norm.training and not norm.synchronized and norm.momentum else None
+    if fused is not None:
+        check_rows(len(products))
+        out: Tensor = fused.normed_relu(products, norm, bias, size)
+        return out
+    rows: Tensor = norm(products if bias is None else products + bias).relu()
+    return rows if size is None else rows.view(-1, size, rows.shape[1]).amax(1)
+
+
+def pooled(mlp: layers.MLP, x: Tensor) -> Tensor:
+    """Groups of rows (..., k, C) through all layers, and the maximum of each: (..., C'). For a GPU."""
+    *others, last = layers_of(mlp)
+    for layer in others:
+        x = layer(x)
+    products = F.linear(x, last.linear.weight)
+    return normed(last, products.flatten(0, -2), x.shape[-2]).view(*x.shape[:-2], -1)
 
 
 def layers_of(mlp: layers.MLP) -> Sequence[layers.Layer]:
@@ -69,6 +90,15 @@ def first_weight(mlp: layers.MLP, split: int) -> tuple[Tensor, Tensor]:
     return weight[:, :split], weight[:, split:]
 
 
+class Layer(layers.Layer):
+    """`networks.layers.Layer`, on a GPU with batch norm and ReLU as one."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        if x.device.type == "cpu" or not self.training:
+            return super().forward(x)
+        return normed(self, F.linear(x, self.linear.weight).flatten(0, -2)).view(*x.shape[:-1], -1)
+
+
 class MLP(layers.MLP):
     """`networks.layers.MLP`, its layers streamed."""
 
@@ -80,6 +110,8 @@ class PooledMLP(layers.PooledMLP):
     """The maximum is taken of the last products, before batch norm and ReLU."""
 
     def forward(self, x: Tensor) -> Tensor:
+        if x.device.type != "cpu":
+            return pooled(self, x)
         return through(self, x.flatten(0, 1), groups=whole(*x.shape[:2]))
 
 
@@ -98,6 +130,8 @@ class Abstraction(layers.Abstraction):
     """An offset is point minus center: both are multiplied, with the features, before they are gathered."""
 
     def forward(self, points: Tensor, features: Tensor, centers: Tensor) -> Tensor:
+        if points.device.type != "cpu":
+            return pooled(self.mlp, self.grouped(points, features, centers))
         (clouds, n, _), m = points.shape, centers.shape[1]
         neighbors = ball_query(centers, points, self.radius, self.k)
         groups = (distinct if streamed(points, self.training) else single)(neighbors, n)
@@ -111,6 +145,8 @@ class Propagation(layers.Propagation):
     """Features are multiplied at the coarse points, then interpolated."""
 
     def forward(self, fine_points: Tensor, coarse_points: Tensor, skip: Tensor, features: Tensor) -> Tensor:
+        if fine_points.device.type != "cpu":
+            return super().forward(fine_points, coarse_points, skip, features)
         clouds, m, _ = coarse_points.shape
         dist_sq, idx = knn(fine_points, coarse_points, min(3, m))
         inverse = 1 / (dist_sq.sqrt() + 1e-8)
@@ -129,4 +165,4 @@ class EdgeConvolution(pugeo.EdgeConvolution):
         return self.pooled(self.center(x)[:, :, None] + gather(self.neighbor(x), neighbors))
 
 
-ALL: tuple[type[nn.Module], ...] = (MLP, PooledMLP, JoinedMLP, Abstraction, Propagation, EdgeConvolution)
+ALL: tuple[type[nn.Module], ...] = (Layer, MLP, PooledMLP, JoinedMLP, Abstraction, Propagation, EdgeConvolution)

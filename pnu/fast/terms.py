@@ -1,6 +1,6 @@
-"""The three neighborhood terms of the loss at once: value and gradient in one pass over pieces in the cache. CPU only.
+"""The three neighborhood terms of the loss at once: value and gradient in one pass over pieces in the cache.
 
-Saves about 5 % of a training step.
+Saves about 5 % of a training step on the CPU; on a GPU `term_kernels` do the same.
 """
 
 from collections.abc import Callable
@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from pnu.fast.gpu import kernels
 from pnu.losses import compound
 from pnu.runtime.threads import map_on_threads
 
@@ -21,10 +22,11 @@ class CompoundLoss(compound.CompoundLoss):
 
     def neighborhood_terms(self, prediction: Tensor, neighbors: Tensor) -> dict[str, Tensor]:
         """As the plain loss has them; prediction (B, m, 6), neighbors (B, m, k)."""
-        if prediction.shape[-1] != 6 or prediction.device.type != "cpu":
+        on_gpu = kernels("term_kernels", prediction)
+        if prediction.shape[-1] != 6 or (prediction.device.type != "cpu" and on_gpu is None):
             return super().neighborhood_terms(prediction, neighbors)
         count = neighbors.numel() if self.reduction == "mean" else len(neighbors)
-        values = sums(prediction, neighbors, self.absolute, compound.TINY) / count
+        values = (on_gpu.sums if on_gpu else sums)(prediction, neighbors, self.absolute, compound.TINY) / count
         return dict(zip(("point_knn", "normal_orth", "normal_knn"), values, strict=True))
 
 

@@ -18,45 +18,75 @@ if not hasattr(tl, "topk"):
 NO_CANDIDATE = tl.constexpr(0x7FFFFFFFFFFFFFFF)
 INDEX_BITS = tl.constexpr(32)
 INDEX_MASK = tl.constexpr(0xFFFFFFFF)
+NEAREST_BLOCK = 32, 64  # queries and groups of targets of a program of `_nearest`
 
 
 @triton.jit
-def _distance_sq(query, rows, m, target, columns, n):
-    """(rows, columns) squared distances; rows and columns beyond the clouds read as zero."""
-    total = tl.zeros((rows.shape[0], columns.shape[0]), tl.float32)
-    for axis in tl.static_range(3):
-        q = tl.load(query + rows * 3 + axis, rows < m, 0.0)
-        t = tl.load(target + columns * 3 + axis, columns < n, 0.0)
-        difference = q[:, None] - t[None, :]
-        total += difference * difference
-    return total
+def _xyz(points, rows, n):
+    """Coordinates of some points, each (rows); zero beyond the cloud."""
+    inside = rows < n
+    x = tl.load(points + rows * 3, inside, 0.0)
+    y = tl.load(points + rows * 3 + 1, inside, 0.0)
+    z = tl.load(points + rows * 3 + 2, inside, 0.0)
+    return x, y, z
 
 
 @triton.jit
-def _candidates(query, rows, m, target, columns, n):
-    distance = _distance_sq(query, rows, m, target, columns, n)
-    key = (distance.to(tl.int32, bitcast=True).to(tl.int64) << INDEX_BITS) | columns[None, :].to(tl.int64)
-    return tl.where(columns[None, :] < n, key, NO_CANDIDATE)
+def _distance_sq(x, y, z, target, columns, n):
+    """(rows, columns) squared distances of queries to targets."""
+    a, b, c = _xyz(target, columns, n)
+    a = x[:, None] - a[None, :]
+    b = y[:, None] - b[None, :]
+    c = z[:, None] - c[None, :]
+    return a * a + b * b + c * c
+
+
+@triton.jit
+def _keys(distance, columns):
+    """Candidates of distances (rows, columns) of targets (rows or 1, columns)."""
+    return (distance.to(tl.int32, bitcast=True).to(tl.int64) << INDEX_BITS) | columns.to(tl.int64)
+
+
+@triton.jit
+def _candidates(x, y, z, target, columns, n):
+    distance = _distance_sq(x, y, z, target, columns, n)
+    return tl.where(columns[None, :] < n, _keys(distance, columns[None, :]), NO_CANDIDATE)
 
 
 @triton.jit
 def _nearest(query, target, dist_sq, idx, m, n, k, K: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
-    """One pass over the targets, the nearest K so far beside each block's: faster than `_knn` for one or two."""
+    """One or two neighbors (K) in one pass: of each of COLUMNS groups of targets the nearest K, joined at the end."""
     cloud = tl.program_id(1).to(tl.int64)
     query, target = query + cloud * m * 3, target + cloud * n * 3
     rows = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
-    best = tl.full((ROWS, K), NO_CANDIDATE, tl.int64)
+    x, y, z = _xyz(query, rows, m)
+    columns = tl.arange(0, COLUMNS)
+    first = tl.full((ROWS, COLUMNS), float("inf"), tl.float32)
+    second = first
+    of_first = tl.zeros((ROWS, COLUMNS), tl.int32) + columns[None, :]
+    of_second = of_first
     for start in range(0, n, COLUMNS):
-        keys = _candidates(query, rows, m, target, start + tl.arange(0, COLUMNS), n)
-        best = _joined(best, keys, K)
+        at = start + columns
+        distance = tl.where((at < n)[None, :], _distance_sq(x, y, z, target, at, n), float("inf"))
+        nearer = distance < first
+        if K == 2:
+            close = distance < second
+            second = tl.where(nearer, first, tl.where(close, distance, second))
+            of_second = tl.where(nearer, of_first, tl.where(close, at[None, :], of_second))
+        first = tl.where(nearer, distance, first)
+        of_first = tl.where(nearer, at[None, :], of_first)
+    best = tl.where(of_first < n, _keys(first, of_first), NO_CANDIDATE)
+    if K == 2:
+        others = tl.where(of_second < n, _keys(second, of_second), NO_CANDIDATE)
+        best = -tl.topk(-tl.reshape(tl.join(best, others), (ROWS, 2 * COLUMNS)), 2)
+    else:
+        best = tl.min(best, axis=1)[:, None]
     _store(best, rows, dist_sq + cloud * m * k, idx + cloud * m * k, m, k)
 
 
 @triton.jit
 def _joined(best, keys, K: tl.constexpr):
     """The K smallest of both, (rows, K) and (rows, columns)."""
-    if K == 1:
-        return tl.minimum(best, tl.min(keys, axis=1)[:, None])
     # topk keeps the largest, so everything is negated
     return -tl.topk(-tl.reshape(tl.join(best, -tl.topk(-keys, K)), (best.shape[0], 2 * K)), K)
 
@@ -80,21 +110,21 @@ def _knn(query, target, close, dist_sq, idx, m, n, k,
     cloud = tl.program_id(1).to(tl.int64)
     query, target = query + cloud * m * 3, target + cloud * n * 3
     rows = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
+    x, y, z = _xyz(query, rows, m)
     least = tl.full((ROWS, COLUMNS), float("inf"), tl.float32)
     for start in range(0, n, COLUMNS):
         columns = start + tl.arange(0, COLUMNS)
-        distance = _distance_sq(query, rows, m, target, columns, n)
+        distance = _distance_sq(x, y, z, target, columns, n)
         least = tl.minimum(least, tl.where(columns[None, :] < n, distance, float("inf")))
     bound = tl.max(-tl.topk(-least, K), axis=1) * 1.000001  # whatever rounding the second pass has
     found = tl.zeros((ROWS,), tl.int32)
     space = close + (cloud * m + rows[:, None]) * SPACE
     for start in range(0, n, COLUMNS):
         columns = start + tl.arange(0, COLUMNS)
-        distance = _distance_sq(query, rows, m, target, columns, n)
+        distance = _distance_sq(x, y, z, target, columns, n)
         near = (rows[:, None] < m) & (columns[None, :] < n) & ~(distance > bound[:, None])  # NaN is a candidate, too
-        key = (distance.to(tl.int32, bitcast=True).to(tl.int64) << INDEX_BITS) | columns[None, :].to(tl.int64)
         place = found[:, None] + tl.cumsum(near.to(tl.int32), axis=1) - 1
-        tl.store(space + place, key, near & (place < SPACE))
+        tl.store(space + place, _keys(distance, columns[None, :]), near & (place < SPACE))
         found += tl.sum(near.to(tl.int32), axis=1)
     best = tl.full((ROWS, K), NO_CANDIDATE, tl.int64)
     if tl.max(found) <= SPACE:
@@ -103,7 +133,7 @@ def _knn(query, target, close, dist_sq, idx, m, n, k,
         best = -tl.topk(-tl.load(space + slots, slots < found[:, None], NO_CANDIDATE), K)
     else:  # many equal distances
         for start in range(0, n, SORTED):
-            best = _joined(best, _candidates(query, rows, m, target, start + tl.arange(0, SORTED), n), K)
+            best = _joined(best, _candidates(x, y, z, target, start + tl.arange(0, SORTED), n), K)
     _store(best, rows, dist_sq + cloud * m * k, idx + cloud * m * k, m, k)
 
 
@@ -118,9 +148,9 @@ def knn(query: Tensor, target: Tensor, k: int) -> tuple[Tensor, Tensor]:
     idx = torch.empty(batch, m, k, dtype=torch.int64, device=query.device)
     slots = triton.next_power_of_2(k)
     if slots <= 2:
-        rows, columns, warps = nearest_block(slots)
+        rows, columns = NEAREST_BLOCK
         grid = (triton.cdiv(m, rows), batch)
-        _nearest[grid](query, target, dist_sq, idx, m, n, k, slots, rows, columns, num_warps=warps)
+        _nearest[grid](query, target, dist_sq, idx, m, n, k, slots, rows, columns)
         return dist_sq, idx
     columns, space = knn_columns(slots)
     close = torch.empty(batch, m, space, dtype=torch.int64, device=query.device)
@@ -128,11 +158,6 @@ def knn(query: Tensor, target: Tensor, k: int) -> tuple[Tensor, Tensor]:
         query, target, close, dist_sq, idx, m, n, k, slots, 16, columns, space, max(32, slots)
     )
     return dist_sq, idx
-
-
-def nearest_block(slots: int) -> tuple[int, int, int]:
-    """Queries, targets and warps of a program of `_nearest`, for one or two neighbors: the fastest seen on an H100."""
-    return (32, 32, 1) if slots == 1 else (16, 64, 4)
 
 
 def knn_columns(slots: int) -> tuple[int, int]:
@@ -146,12 +171,13 @@ def _ball(query, target, idx, m, n, k, radius, K: tl.constexpr, ROWS: tl.constex
     cloud = tl.program_id(1).to(tl.int64)
     query, target = query + cloud * m * 3, target + cloud * n * 3
     rows = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
+    x, y, z = _xyz(query, rows, m)
     idx += cloud * m * k + rows[:, None] * k
     found = tl.zeros((ROWS,), tl.int32)
     first = tl.full((ROWS,), n, tl.int32)
     for start in range(0, n, COLUMNS):
         columns = start + tl.arange(0, COLUMNS)
-        distance = tl.sqrt(_distance_sq(query, rows, m, target, columns, n))
+        distance = tl.sqrt(_distance_sq(x, y, z, target, columns, n))
         inside = (distance < radius) & (columns[None, :] < n) & (rows[:, None] < m)
         first = tl.minimum(first, tl.min(tl.where(inside, columns[None, :], n), axis=1))
         place = found[:, None] + tl.cumsum(inside.to(tl.int32), axis=1) - 1

@@ -73,10 +73,14 @@ class Abstraction(nn.Module):
 
     def forward(self, points: Tensor, features: Tensor, centers: Tensor) -> Tensor:
         """Features (B, n, C) at points (B, n, 3), pooled around centers (B, m, 3): (B, m, C')."""
+        rows: Tensor = self.mlp(self.grouped(points, features, centers))  # (B, m, k, C')
+        return rows.amax(2)
+
+    def grouped(self, points: Tensor, features: Tensor, centers: Tensor) -> Tensor:
+        """[offset, feature] of the neighbors of each center: (B, m, k, 3 + C)."""
         neighbors = ball_query(centers, points, self.radius, self.k)
         offsets = gather(points, neighbors) - centers[:, :, None]
-        rows: Tensor = self.mlp(torch.cat([offsets, gather(features, neighbors)], -1))  # (B, m, k, 3 + C) -> C'
-        return rows.amax(2)
+        return torch.cat([offsets, gather(features, neighbors)], -1)
 
 
 class Propagation(nn.Module):

@@ -58,12 +58,11 @@ class AdversarialModule(UpsamplingModule):
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """The generator's optimizer and schedule, and the discriminator's optimizer, whose rate follows."""
-        assert self.optimizer is not None
         assert isinstance(self.loss, AdversarialLoss)
-        found: Any = self.scheduled(self.optimizer(self.model.parameters()))
+        found: Any = self.scheduled(self.optimizer_of(self.model.parameters()))
         schedulers = [found["lr_scheduler"]] if isinstance(found, dict) else []
         first = found["optimizer"] if isinstance(found, dict) else found
-        return [first, self.optimizer(self.loss.discriminator.parameters())], schedulers
+        return [first, self.optimizer_of(self.loss.discriminator.parameters())], schedulers
 
 
 @contextmanager

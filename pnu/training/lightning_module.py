@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -119,6 +119,18 @@ def _finite(value: Tensor) -> bool:
     return math.isfinite(float(value))
 
 
+class StepValues(NamedTuple):
+    """Values of a step that are on their way from the device."""
+
+    step: int
+    names: list[str]
+    found: Tensor  # (micro-batches, names), on the device
+    means: Tensor  # of the names over micro-batches and processes, the gradient's norm, the clock
+    ready: torch.cuda.Event | None  # when means have come
+    lr: float
+    batches: list[Batch]
+
+
 class UpsamplingModule(pl.LightningModule):
     """A network and its loss.
 
@@ -155,6 +167,8 @@ class UpsamplingModule(pl.LightningModule):
         self.val_metrics, self.test_metrics = CloudMetrics(normals, metrics), CloudMetrics(normals, metrics)
         self.captured: Callable[[Batch], dict[str, Tensor]] | None = None  # `values` as a graph, see `captured_step`
         self.micro_batches: list[tuple[dict[str, Tensor], Batch]] = []  # of this step: values and batch
+        self.unread: list[StepValues] = []
+        self.last_loss: float | None = None  # that was read
         self.started_at, self.elapsed_s = time.monotonic(), 0.0  # elapsed_s is the same in all processes
 
     def forward(self, patch: Tensor) -> Tensor:
@@ -176,41 +190,84 @@ class UpsamplingModule(pl.LightningModule):
             with torch.autocast(self.device.type, enabled=False):
                 terms = self.loss(outputs["prediction"], batch["target"], {**batch, **outputs})
         except Exception:  # a loss may break at NaN, with words about something else
-            self.micro_batches.append((found, batch))
-            self.check_finite(found)
+            self.stop(self.global_step, found, [*self.micro_batches, (found, batch)])
             raise
         values: dict[str, Tensor] = found | terms
         return values
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Checks and logs the step: means over micro-batches and processes, in one transfer from the device."""
+        """Means of the step over micro-batches and processes, to be checked and logged. On a GPU they are read while it
+        has the next step to do: waiting for each would leave it idle in between."""
         gradients = [p.grad for p in self.parameters() if p.grad is not None]
         norm = torch.nn.utils.get_total_norm(gradients) if gradients else torch.zeros((), device=self.device)
         names = list(self.micro_batches[0][0])
         found = torch.stack([values[name].to(norm) for values, _ in self.micro_batches for name in names])
+        found = found.view(-1, len(names))
         clock = norm.new_tensor(time.monotonic() - self.started_at)
-        means = torch.cat([found.view(-1, len(names)).mean(0), norm[None], clock[None]])
-        means = self.trainer.strategy.reduce(means, reduce_op="mean")
-        *numbers, gradient_norm, self.elapsed_s = means.tolist()
-        values = dict(zip(names, numbers, strict=True))
-        # in mixed precision the scaler expects infinite gradients and skips their step
-        self.check_finite(values if self.trainer.precision == "16-mixed" else values | {"gradient": gradient_norm})
+        means = self.trainer.strategy.reduce(torch.cat([found.mean(0), norm[None], clock[None]]), reduce_op="mean")
+        self.unread.append(
+            StepValues(
+                self.global_step, names, found, means.to("cpu", non_blocking=True),
+                torch.cuda.current_stream().record_event() if means.device.type == "cuda" else None,
+                float(optimizer.param_groups[0]["lr"]), [batch for _, batch in self.micro_batches],
+            )
+        )  # fmt: skip
         self.micro_batches = []
-        del values["prediction"]
-        logged = {f"train/{name}": value for name, value in values.items()}
-        logged |= {"train/gradient_norm": gradient_norm, "train/lr": float(optimizer.param_groups[0]["lr"])}
-        # for bars and for stopping early; as a tensor of the CPU, since a number would be sent to the device and back.
-        # Lightning takes a millisecond for each, so the others go to the loggers alone
-        self.log("train/loss", torch.tensor(values["loss"]), logger=False)
-        # written at once, before the checkpoint of this step: a training that is killed after it loses no step's values
-        for logger in self.loggers:
-            logger.log_metrics(logged, self.global_step)
+        self.read_steps(keep=self.steps_behind)
+        if self.last_loss is not None:
+            # for bars and for stopping early; as a tensor of the CPU, since a number would be sent to the device and
+            # back. Lightning takes a millisecond for each, so the others go to the loggers alone
+            self.log("train/loss", torch.tensor(self.last_loss), logger=False)
 
-    def check_finite(self, values: Mapping[str, float | Tensor]) -> None:
-        """Stop the training at NaN or infinity and keep the micro-batches that it comes from for inspection.
+    @property
+    def steps_behind(self) -> int:
+        """Steps whose values are not waited for before the next."""
+        return int(self.device.type == "cuda")
+
+    def read_steps(self, keep: int = 0) -> None:
+        """Check and log the values of all steps but the last `keep`."""
+        while len(self.unread) > keep:
+            step = self.unread.pop(0)
+            if step.ready is not None:
+                step.ready.synchronize()
+            *numbers, gradient_norm, self.elapsed_s = step.means.tolist()
+            values = dict(zip(step.names, numbers, strict=True))
+            # in mixed precision the scaler expects infinite gradients and skips their step
+            checked = values if self.trainer.precision == "16-mixed" else values | {"gradient": gradient_norm}
+            if not all(map(math.isfinite, checked.values())):
+                rows = [dict(zip(step.names, row.unbind(), strict=True)) for row in step.found]
+                self.stop(step.step, checked, list(zip(rows, step.batches, strict=True)))
+            del values["prediction"]
+            self.last_loss = values["loss"]
+            logged = {f"train/{name}": value for name, value in values.items()}
+            logged |= {"train/gradient_norm": gradient_norm, "train/lr": step.lr}
+            for logger in self.loggers:
+                logger.log_metrics(logged, step.step)
+
+    def on_validation_start(self) -> None:
+        self.read_steps()
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """What led to the state that is saved is checked and written before it: a training that is killed afterwards
+        loses no step's values, and a broken state is not kept."""
+        self.read_steps()
+
+    def on_train_end(self) -> None:
+        self.read_steps()
+
+    def stop(
+        self,
+        step: int,
+        values: Mapping[str, float | Tensor],
+        micro_batches: Sequence[tuple[Mapping[str, Tensor], Batch]],
+    ) -> None:
+        """End the training at NaN or infinity and keep the micro-batches that it comes from for inspection; do nothing
+        where all values are finite.
 
         Args:
-            values: of a step, means over micro-batches and processes.
+            step: whose values these are.
+            values: means over micro-batches and processes.
+            micro_batches: of the step, each with its own values.
 
         Raises:
             NonFinite: names the step, the terms and the file with the batch.
@@ -218,16 +275,14 @@ class UpsamplingModule(pl.LightningModule):
         broken = [name for name, value in values.items() if not math.isfinite(float(value))]
         if not broken:
             return
-        here = [(terms, batch) for terms, batch in self.micro_batches if not all(map(_finite, terms.values()))]
-        kept = here or self.micro_batches  # of a gradient alone any of them may be the cause
-        path = Path(self.trainer.default_root_dir) / f"nonfinite_step{self.global_step}_rank{self.global_rank}.pt"
+        here = [(terms, batch) for terms, batch in micro_batches if not all(map(_finite, terms.values()))]
+        kept = here or micro_batches  # of a gradient alone any of them may be the cause
+        path = Path(self.trainer.default_root_dir) / f"nonfinite_step{step}_rank{self.global_rank}.pt"
         terms = {name: float(value) for name, value in (kept[0][0] if here else values).items()}
-        write_checkpoint(
-            path, {"step": self.global_step, "terms": terms, "batch": joined([batch for _, batch in kept])}
-        )
+        write_checkpoint(path, {"step": step, "terms": terms, "batch": joined([batch for _, batch in kept])})
         first = next((name for name in broken if name != "loss"), broken[0])
         raise NonFinite(
-            f"step {self.global_step}: {first} is {float(values[first])}; the batch is in {path};"
+            f"step {step}: {first} is {float(values[first])}; the batch is in {path};"
             " a lower optimizer.lr or trainer.gradient_clip_val=1 often cures it"
         )
 
@@ -264,8 +319,20 @@ class UpsamplingModule(pl.LightningModule):
         return next((callback for callback in callbacks if isinstance(callback, Timer)), None)
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
+        return self.scheduled(self.optimizer_of(self.parameters()))
+
+    def optimizer_of(self, parameters: Iterator[nn.Parameter]) -> torch.optim.Optimizer:
+        """The optimizer; on a GPU in one kernel for all parameters, where it has one and no scaler is in its way."""
         assert self.optimizer is not None
-        return self.scheduled(self.optimizer(self.parameters()))
+        made = getattr(self.optimizer, "func", self.optimizer)
+        fused = self.device.type == "cuda" and self.trainer.precision != "16-mixed"
+        if (
+            fused
+            and "fused" in inspect.signature(made).parameters
+            and "fused" not in getattr(self.optimizer, "keywords", {})
+        ):
+            return self.optimizer(parameters, fused=True)
+        return self.optimizer(parameters)
 
     def scheduled(self, optimizer: torch.optim.Optimizer) -> OptimizerLRScheduler:
         """An optimizer, with its schedule where there is one."""

@@ -66,6 +66,17 @@ def test_knn_of_points_that_are_not_numbers() -> None:
     assert torch.equal(idx.cpu()[:, good], torch.arange(70)[good][expected.indices])
 
 
+@pytest.mark.parametrize("k", [1, 2])
+def test_nearest_of_points_that_are_not_numbers(k: int) -> None:
+    """What they get can be looked up: a training stops at them with words, not with a broken device."""
+    query, target = cloud(1, 5), cloud(1, 150)
+    query[0, 2] = torch.nan
+    _, idx = triton_kernels.knn(query.to(DEVICE), target.to(DEVICE), k)
+    good = torch.arange(5) != 2
+    assert torch.equal(idx.cpu()[:, good], distances_sq(query[:, good], target).topk(k, largest=False).indices)
+    assert ((idx >= 0) & (idx < 150)).all()
+
+
 @pytest.mark.parametrize(("radius", "k"), [(0.05, 4), (0.2, 5), (2.0, 8)])
 def test_ball_query(radius: float, k: int) -> None:
     query, target = cloud(2, 20), cloud(2, 200)
@@ -215,10 +226,8 @@ def compiled(kernel, types, warps=4, **constants):
     print(len(built.asm["cubin"]))
 
 for k in (1, 2):
-    rows, columns, warps = kernels.nearest_block(k)
-    compiled(
-        kernels._nearest, [FLOAT, FLOAT, FLOAT, INDEX, "i32", "i32", "i32"], warps, K=k, ROWS=rows, COLUMNS=columns
-    )
+    rows, columns = kernels.NEAREST_BLOCK
+    compiled(kernels._nearest, [FLOAT, FLOAT, FLOAT, INDEX, "i32", "i32", "i32"], K=k, ROWS=rows, COLUMNS=columns)
 for k in (4, 16, 64):
     columns, space = kernels.knn_columns(k)
     compiled(

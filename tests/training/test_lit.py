@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader, Dataset, Subset
 
 from pnu.losses import CompoundLoss
 from pnu.metrics import chamfer_sq
-from pnu.training.lightning_module import TRAINER_OPTIONS, NonFinite, UpsamplingModule, quieten
+from pnu.training.lightning_module import TRAINER_OPTIONS, NonFinite, StepValues, UpsamplingModule, quieten
 
 
 class Spread(nn.Module):
@@ -300,6 +300,35 @@ def test_logged_terms_are_means_over_the_micro_batches_of_a_step(
         values = [terms[name] for terms in each]
         expected = [sum(values[:3]) / 3, sum(values[3:]) / micro[1]]
         assert record.values(f"train/{name}") == pytest.approx(expected, rel=1e-5), name
+
+
+def test_values_that_are_read_a_step_later_are_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a GPU: each under its own step, the last one too, and all that led to a checkpoint before it is saved."""
+    records = [Record(), Record()]
+    trainer(tmp_path, records[0], max_steps=3).fit(module(), loader(6), loader(2))
+    monkeypatch.setattr(UpsamplingModule, "steps_behind", 1)
+    late = trainer(tmp_path, records[1], max_steps=3)
+    late.fit(module(), loader(6), loader(2))
+    names = [f"train/{name}" for name in ("cd", "loss", "gradient_norm", "lr")]
+    for name in names:
+        assert records[1].values(name) == pytest.approx(records[0].values(name)), name
+    lit = module()
+    lit.unread = [StepValues(7, ["prediction", "loss"], torch.tensor([[1.0, 2.0]]), torch.tensor([1.0, 2.0, 0.5, 3.0]),
+                             None, 0.1, [{}])]  # fmt: skip
+    lit.trainer = late
+    lit.on_save_checkpoint({})
+    assert (lit.unread, lit.last_loss, lit.elapsed_s) == ([], 2.0, 3.0)
+
+
+def test_a_broken_step_that_is_read_late_is_named_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The step that broke, not the one that is at work when it is seen; no checkpoint is made of it."""
+    monkeypatch.setattr(UpsamplingModule, "steps_behind", 1)
+    lit = trainer(tmp_path, max_steps=5)
+    with pytest.raises(NonFinite, match=r"step 1: prediction is nan"):
+        lit.fit(module(), DataLoader(Spheres(4, broken=1), batch_size=1), loader(2))
+    saved = torch.load(next(tmp_path.glob("nonfinite*.pt")), weights_only=True)
+    assert (saved["step"], saved["batch"]["index"].tolist()) == (1, [1])
+    assert math.isnan(saved["terms"]["prediction"])
 
 
 @pytest.mark.parametrize("broken", [0, 1, 2])
