@@ -46,6 +46,7 @@ class EpochDataModule(pl.LightningDataModule):
     """
 
     kind = "samples"  # what a sample is called in messages
+    evaluated_here = False  # validation and test are loaded in the training's own process, whatever `workers` is
     collate: Callable[[Any], Any] | None = None
     collate_evaluation: Callable[[Any], Any] | None = None
 
@@ -84,7 +85,7 @@ class EpochDataModule(pl.LightningDataModule):
         sampler = EpochSampler(len(data), self.batch_size, seed=self.seed, rank=rank, world=world)  # type: ignore[arg-type]
         done, per_epoch = self.resumed
         sampler.start_at(done // per_epoch, done % per_epoch)
-        return self.loader(data, self.batch_size, sampler=sampler, collate_fn=self.collate)
+        return self.loader(data, self.batch_size, self.workers, sampler=sampler, collate_fn=self.collate)
 
     def val_dataloader(self) -> DataLoader[Any]:
         return self.evaluation_loader("val")
@@ -99,15 +100,15 @@ class EpochDataModule(pl.LightningDataModule):
         number: int = len(data)  # type: ignore[arg-type]
         if number >= world:  # of fewer every process takes all: the mean over all of them is the same
             data = Subset(data, range(rank, number, world))
-        return self.loader(data, self.evaluation_batch_size, collate_fn=self.collate_evaluation)
+        workers = 0 if self.evaluated_here else self.workers
+        return self.loader(data, self.evaluation_batch_size, workers, collate_fn=self.collate_evaluation)
 
-    def loader(self, data: Dataset[Any], batch_size: int, **options: Any) -> DataLoader[Any]:
-        """Batches of a dataset, by as many processes as `workers`."""
+    def loader(self, data: Dataset[Any], batch_size: int, workers: int, **options: Any) -> DataLoader[Any]:
+        """Batches of a dataset, by so many processes."""
         # spawned workers: a fork of a process with threads may hang
-        context = "spawn" if self.workers else None
         return DataLoader(
-            data, batch_size, num_workers=self.workers, multiprocessing_context=context,
-            persistent_workers=self.workers > 0, **options,
+            data, batch_size, num_workers=workers, multiprocessing_context="spawn" if workers else None,
+            persistent_workers=workers > 0, **options,
         )  # fmt: skip
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
@@ -145,7 +146,7 @@ class PatchDataModule(EpochDataModule):
     Args:
         path: HDF5 file of patches, see data/README.md
         batch_size: patches of a training step, on each device
-        workers: processes that load; 0: the training's own; the data are the same with any number
+        workers: processes that load training patches; 0: the training's own; the data are the same with any number
         seed: of order, downsampling and augmentation
         input_points: points of an input patch
         target_points: points of a target patch; fewer than the file has take a smaller patch
@@ -160,6 +161,7 @@ class PatchDataModule(EpochDataModule):
     """
 
     kind = "patches"
+    evaluated_here = True  # a patch takes two milliseconds, starting processes takes seconds
 
     def __init__(
         self,

@@ -122,7 +122,7 @@ def test_sampling_compares_on_the_same_clouds(patch_file: Path) -> None:  # noqa
     def batch(part: str, **options: str) -> torch.Tensor:
         data = PatchDataModule(str(patch_file), batch_size=2, input_points=64, target_points=256, **options)
         data.setup()
-        return next(iter(data.loader(data.dataset(part), 2)))["input"]
+        return next(iter(data.loader(data.dataset(part), 2, 0)))["input"]
 
     uniform = {"downsampling": "poisson", "evaluation": "nonuniform"}
     assert torch.equal(batch("val", **uniform), batch("val"))
