@@ -1,9 +1,12 @@
 """Ratios of run times: contestants run in turn, A B A B, so that a drift of the machine's speed hits all alike."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from statistics import median
+from typing import Any
+
+LIMIT = 1.1  # times as long beside an alternative as committed, and ours counts as slower
 
 
 @dataclass(frozen=True)
@@ -36,3 +39,23 @@ def compare(name: str, contestants: Mapping[str, Callable[[], object]], *, round
             run()
             taken[contestant].append(time.perf_counter() - started)
     return Row(name, {contestant: median(values) for contestant, values in taken.items()})
+
+
+def entries(rows: Iterable[Row], made: str) -> dict[str, Any]:
+    """Ratios of rows as they are committed, by name, with what they were made with."""
+    return {row.name: {"made": made, "ratios": {k: round(v, 3) for k, v in row.ratios.items()}} for row in rows}
+
+
+def slower(rows: Iterable[Row], committed: Mapping[str, Any]) -> dict[tuple[str, str], float]:
+    """By row and alternative: how many times as long ours takes beside it as in `entries`, where more than LIMIT.
+
+    A ratio that is not among them is not judged.
+    """
+    found = {}
+    for row in rows:
+        before = committed.get(row.name, {"ratios": {}})["ratios"]
+        for other, ratio in row.ratios.items():
+            factor = before.get(other, 0) / ratio
+            if factor > LIMIT:
+                found[row.name, other] = factor
+    return found

@@ -2,17 +2,18 @@
 
 import sys
 
-from pnu.kernels.compilation import compile_all, complete, folder, reason
+from pnu.kernels.compilation import compile_all, complete, reason, wanting
 from pnu.runtime import system_libraries
 
 
 def kernels_line(*, install: bool) -> str:
     """Compile the kernels if they are to be installed; whether they are there and, if not, why and what that means."""
-    if install and not complete() and folder() is not None:
+    if install and wanting():
         print("compiling kernels for this processor, once: about a minute", flush=True)
         compile_all()
     if complete():
-        return "Compiled kernels are here."
+        damaged = "; their machine code is missing or damaged: pnu doctor --install writes it anew" if wanting() else ""
+        return f"Compiled kernels are here{damaged}."
     why = reason() or "pnu doctor --install compiles them"
     return f"Compiled kernels are not here ({why}): `surface` takes a few times as long, with the same results."
 

@@ -33,22 +33,24 @@ def through(
     *,
     projected: bool = False,
     groups: Neighborhoods | None = None,
-    centers: Tensor | None = None,
+    offsets: Tensor | None = None,
 ) -> Tensor:
     """Rows (..., C) through all layers.
 
     Args:
         projected: x already holds the products of the first layer's weight, without bias.
         groups: x is (R, C) and the output the maximum over groups of rows, (G, C').
-        centers: (G, C), with groups: x is a table (n, C), and row r is x[source[r]] - centers[owner[r]].
+        offsets: (R, D), if projected and with groups: x is a table (n, C) of the products of all columns but the first
+            D, and row r is x[source[r]] plus the products of offsets[r], the first D.
     """
     rows = x.reshape(-1, x.shape[-1])
     if streamed(x, mlp.training):
         run = stack.train_stack if mlp.training else stack.infer_stack
-        rows = run(rows, layers_of(mlp), projected=projected, groups=groups, centers=centers)
+        rows = run(rows, layers_of(mlp), projected=projected, groups=groups, offsets=offsets)
     else:
-        if groups is not None and centers is not None:
-            rows = combine(rows, groups.source[:, None]) - centers[groups.owner]
+        if groups is not None and offsets is not None:
+            of_offsets, _ = first_weight(mlp, offsets.shape[1])
+            rows = combine(rows, groups.source[:, None]) + F.linear(offsets, of_offsets)
         for i, layer in enumerate(layers_of(mlp)):
             rows = normed(layer, rows) if projected and i == 0 else layer(rows)
         rows = rows if groups is None else pool(rows, groups)
@@ -127,7 +129,7 @@ class JoinedMLP(layers.JoinedMLP):
 
 
 class Abstraction(layers.Abstraction):
-    """An offset is point minus center: both are multiplied, with the features, before they are gathered."""
+    """Features are multiplied before they are gathered; an offset is point minus center first, and multiplied then."""
 
     def forward(self, points: Tensor, features: Tensor, centers: Tensor) -> Tensor:
         if points.device.type != "cpu":
@@ -135,10 +137,10 @@ class Abstraction(layers.Abstraction):
         (clouds, n, _), m = points.shape, centers.shape[1]
         neighbors = ball_query(centers, points, self.radius, self.k)
         groups = (distinct if streamed(points, self.training) else single)(neighbors, n)
-        of_offsets, _ = first_weight(self.mlp, 3)
-        of_points = F.linear(torch.cat([points, features], -1).flatten(0, 1), layers_of(self.mlp)[0].linear.weight)
-        of_centers = F.linear(centers.reshape(-1, 3), of_offsets)
-        return through(self.mlp, of_points, projected=True, groups=groups, centers=of_centers).view(clouds, m, -1)
+        there, here = combine(points.flatten(0, 1), groups.source[:, None]), centers.flatten(0, 1)[groups.owner]
+        _, of_features = first_weight(self.mlp, 3)
+        products = F.linear(features.flatten(0, 1), of_features)
+        return through(self.mlp, products, projected=True, groups=groups, offsets=there - here).view(clouds, m, -1)
 
 
 class Propagation(layers.Propagation):

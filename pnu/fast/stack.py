@@ -11,7 +11,7 @@ batch norm cancels whatever constant is added to its input:
 - the sum of gradient times activation, which batch norm needs, follows from the weight and its gradient;
 - the maximum over a group commutes with the monotone batch norm and ReLU after it, so the products are pooled;
 - rows that count several times (`Groups.multiplicity`) are computed once and weighted in the statistics;
-- differences of two tables are made where they are used and never stored.
+- rows gathered from a table, plus products of their offsets, are made where they are used and never stored.
 
 Results are those of the plain layers to rounding, and the same bit for bit in every run with as many threads.
 """
@@ -41,22 +41,24 @@ def train_stack(
     *,
     projected: bool = False,
     groups: Neighborhoods | None = None,
-    centers: Tensor | None = None,
+    offsets: Tensor | None = None,
 ) -> Tensor:
     """Layers in training mode on CPU rows x (R, C): (R, C'), or their maximum over groups, (G, C').
 
-    With `projected`, x already holds the products of the first layer. With `centers` (neighborhoods, C) too, x is a
-    table (points, C), and row r the difference x[groups.source[r]] - centers[groups.owner[r]].
+    With `projected`, x already holds the products of the first layer. With `offsets` (R, D) too, x is a table
+    (points, C) of the products of all columns but the first D, and row r is x[groups.source[r]] plus the products of
+    offsets[r], the first D.
     """
     falling = layers[0].norm.weight.detach() < 0
+    of_offsets = None if offsets is None else layers[0].linear.weight[:, : offsets.shape[1]]
     if projected and bool(falling.any()):
         sign = _sign(layers[0].norm)
-        x, centers = x * sign, None if centers is None else centers * sign
+        x, of_offsets = x * sign, None if of_offsets is None else of_offsets * sign[:, None]
     weights = [None if projected and i == 0 else layer.linear.weight for i, layer in enumerate(layers)]
     biases = [layer.linear.bias for layer in layers]
     scales, shifts = [layer.norm.weight for layer in layers], [layer.norm.bias for layer in layers]
     apply: Callable[..., Tensor] = _Stack.apply
-    return apply(x, centers, layers, groups, *weights, *biases, *scales, *shifts)
+    return apply(x, offsets, of_offsets, layers, groups, *weights, *biases, *scales, *shifts)
 
 
 def _sign(norm: BatchNorm) -> Tensor:
@@ -115,11 +117,16 @@ class Rows(NamedTuple):
         return self.table[chunk.rows]
 
 
-class Differences(NamedTuple):
-    """Rows table[groups.source] - centers[groups.owner], made when they are asked for."""
+class Gathered(NamedTuple):
+    """Rows table[groups.source] plus products of offsets, made when they are asked for.
+
+    An offset is multiplied after its subtraction: products of a point and of a center near it differ by less than they
+    are rounded by.
+    """
 
     table: Tensor  # (points, C)
-    centers: Tensor  # (G, C), in the order of groups
+    offsets: Tensor  # (R, D)
+    weight: Tensor  # (C, D), of offsets
     groups: Neighborhoods
 
     @property
@@ -131,20 +138,21 @@ class Differences(NamedTuple):
         """Rows of a chunk, in `space`."""
         out = space[: chunk.stop - chunk.start]
         torch.index_select(self.table, 0, self.groups.source[chunk.rows], out=out)
-        chunk.grouped(out).sub_(self.centers[chunk.groups, None])
-        return out
+        return out.addmm_(self.offsets[chunk.rows], self.weight.t())
 
 
-def _rows(x: Tensor, groups: Neighborhoods | None, centers: Tensor | None) -> Rows | Differences:
-    if centers is None or groups is None:
+def _rows(
+    x: Tensor, offsets: Tensor | None, of_offsets: Tensor | None, groups: Neighborhoods | None
+) -> Rows | Gathered:
+    if offsets is None or of_offsets is None or groups is None:
         return Rows(x)
-    return Differences(x, centers if groups.order is None else centers[groups.order], groups)
+    return Gathered(x, offsets, of_offsets, groups)
 
 
 class LayerInput(NamedTuple):
     """Where the input of a layer comes from: rows as they are, or the products of the layer below, rectified."""
 
-    rows: Rows | Differences
+    rows: Rows | Gathered
     norm: Norm | None = None
 
     def chunk(self, chunk: Chunk, space: Tensor) -> Tensor:
@@ -158,14 +166,15 @@ class _Stack(torch.autograd.Function):
     def forward(
         ctx: Any,
         x: Tensor,
-        centers: Tensor | None,
+        offsets: Tensor | None,
+        of_offsets: Tensor | None,
         layers: Sequence[Layer],
         groups: Neighborhoods | None,
         *parameters: Tensor,
     ) -> Tensor:
         often = groups.multiplicity if groups else None
         often = often if often is None else often.to(x.dtype)
-        first = _rows(x, groups, centers)
+        first = _rows(x, offsets, of_offsets, groups)
         source, stored, norms, weights = LayerInput(first), [], [], []
         pooled = None
         for i, layer in enumerate(layers):
@@ -180,8 +189,7 @@ class _Stack(torch.autograd.Function):
             weights.append(weight)
             source = LayerInput(products, norms[-1])
         ctx.layers, ctx.groups, ctx.norms, ctx.points = layers, groups, norms, len(x)
-        sorted_centers = first.centers if isinstance(first, Differences) else None
-        ctx.save_for_backward(often, pooled, x, sorted_centers, *stored, *weights)
+        ctx.save_for_backward(often, pooled, x, offsets, of_offsets, *stored, *weights)
         if pooled is not None and groups is not None:
             return ungroup(norms[-1].activate(pooled, torch.empty_like(pooled)), groups)
         out = x.new_empty(source.rows.shape)
@@ -197,8 +205,8 @@ class _Stack(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         layers, groups, norms, depth = ctx.layers, ctx.groups, ctx.norms, len(ctx.layers)
-        often, pooled, x, centers, *tensors = ctx.saved_tensors
-        first = Rows(x) if centers is None else Differences(x, centers, groups)
+        often, pooled, x, offsets, of_offsets, *tensors = ctx.saved_tensors
+        first = _rows(x, offsets, of_offsets, groups)
         products = [first if table is None else Rows(table) for table in tensors[:depth]]
         sources = [LayerInput(first), *map(LayerInput, products, norms)]  # sources[i] is the input of layer i
         weights = tensors[depth:]
@@ -220,17 +228,19 @@ class _Stack(torch.autograd.Function):
             d_scales.append(sums[1] * norm.inverse_deviation / norm.scale * sign)
             slope_level = _through_statistics(layers[i].norm, norm, sums)
             d_products = _Gradient(products[i], kept, *slope_level, often, groups, pooled)
-            kept, sums, d_weight = _pull_back(d_products, source, weights[i], ctx.needs_input_grad[0])
+            kept, sums, d_weight = _pull_back(d_products, source, weights[i], any(ctx.needs_input_grad[:3]))
             if d_weight is not None:
                 scale = sign[:, None] if source.norm is None else sign[:, None] * source.norm.scale
                 d_weights[i] = d_weight * scale
             pooled = None
         d_biases = [None if layer.linear.bias is None else torch.zeros_like(layer.linear.bias) for layer in layers]
-        d_centers = None
-        if isinstance(first, Differences) and kept is not None:
-            d_centers = ungroup(_sums_of_groups(kept, groups).neg_(), groups)
+        d_offsets = d_of_offsets = None
+        if isinstance(first, Gathered) and kept is not None:
+            d_offsets = kept @ of_offsets if ctx.needs_input_grad[1] else None
+            d_of_offsets = (offsets.t() @ kept).t()  # twice as fast as the other way around
             kept = scatter(kept, groups.source[:, None], None, ctx.points)
-        return (kept, d_centers, None, None, *d_weights, *d_biases, *reversed(d_scales), *reversed(d_shifts))
+        d_parameters = *d_weights, *d_biases, *reversed(d_scales), *reversed(d_shifts)
+        return kept, d_offsets, d_of_offsets, None, None, *d_parameters
 
 
 def _chunks(rows: int, width: int, groups: Neighborhoods | None) -> list[Chunk]:
@@ -244,7 +254,7 @@ def _multiply(
     often: Tensor | None,
     groups: Neighborhoods | None,
     last: bool,
-) -> tuple[Rows | Differences, Tensor | None, Moments]:
+) -> tuple[Rows | Gathered, Tensor | None, Moments]:
     """Products (R, C) of a layer, after the last one their maxima (G, C) over groups if given, and their moments.
 
     A constant (C,), near the mean, is taken off the products: no digits are lost to it, in no layer that follows.
@@ -318,7 +328,7 @@ def _everywhere(norm: BatchNorm, *sums: Tensor) -> list[Tensor]:
 class _Gradient(NamedTuple):
     """Gradient of the products of a layer: directly, and through the mean and variance that they enter."""
 
-    products: Rows | Differences
+    products: Rows | Gathered
     kept: Tensor  # gradient before the ReLU times the scale, (R, C) or of the maxima (G, C)
     slope: Tensor
     level: Tensor
@@ -402,7 +412,7 @@ def _pull_back(
     return result, total, d_weight
 
 
-def _rectify_all(rows: Rows | Differences, norm: Norm, gradient: Tensor) -> tuple[Tensor, Tensor]:
+def _rectify_all(rows: Rows | Gathered, norm: Norm, gradient: Tensor) -> tuple[Tensor, Tensor]:
     """The gradient (R, C) of a stack's output, before the last ReLU and times the last scale; and its sums (2, C)."""
     kept = torch.empty_like(gradient)
     chunks = row_chunks(*gradient.shape)
@@ -424,29 +434,17 @@ def _rectify_all(rows: Rows | Differences, norm: Norm, gradient: Tensor) -> tupl
     return kept, sums.sum(0)
 
 
-def _sums_of_groups(rows: Tensor, groups: Neighborhoods) -> Tensor:
-    """Sums of the rows (R, C) of each group: (G, C)."""
-    result = rows.new_empty(groups.number, rows.shape[1])
-
-    def work(part: list[Chunk]) -> None:
-        for chunk in part:
-            torch.sum(chunk.grouped(rows[chunk.rows]), 1, out=result[chunk.groups])
-
-    map_chunks(work, group_chunks(groups, rows.shape[1]))
-    return result
-
-
 def infer_stack(
     x: Tensor,
     layers: Sequence[Layer],
     *,
     projected: bool = False,
     groups: Neighborhoods | None = None,
-    centers: Tensor | None = None,
+    offsets: Tensor | None = None,
 ) -> Tensor:
     """`train_stack` in eval mode and without gradient: batch norm folded into the weights, no layer stored."""
     folded = [_fold(layer) for layer in layers]
-    rows = _rows(x, groups, centers)
+    rows = _rows(x, offsets, None if offsets is None else layers[0].linear.weight[:, : offsets.shape[1]], groups)
     width = max(rows.shape[1], *(len(shift) for _, _, shift in folded))
     chunks = _chunks(rows.shape[0], width, groups)
     result = x.new_empty(rows.shape[0] if groups is None else groups.number, len(folded[-1][2]))

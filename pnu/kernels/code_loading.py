@@ -112,11 +112,23 @@ class MachineCode:
 def load_code(path: Path) -> MachineCode | None:
     """What a file keeps; None where it is missing or damaged, or cannot be loaded here."""
     try:
-        content = path.read_bytes()
-        whole = hashlib.sha256(content[DIGEST:]).digest() == content[:DIGEST]
-        return MachineCode(content[DIGEST:]) if whole else None
-    except Exception:  # no file, no llvmlite, another one: numba makes the kernels then
+        content = _object_file(path)
+        return None if content is None else MachineCode(content)
+    except Exception:  # no llvmlite, or another one: numba makes the kernels then
         return None
+
+
+def intact(path: Path) -> bool:
+    """Whether a file is there, and as it was written."""
+    return _object_file(path) is not None
+
+
+def _object_file(path: Path) -> bytes | None:
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    return content[DIGEST:] if hashlib.sha256(content[DIGEST:]).digest() == content[:DIGEST] else None
 
 
 def _told(value: Any) -> str:

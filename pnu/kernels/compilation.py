@@ -1,7 +1,8 @@
 """Where compiled kernels are kept, and how they come there. This file loads no numba until something is compiled.
 
 They are kept twice: as numba's own files, whose loading takes a second with numba, and as one file of machine code that
-is loaded without it (`code_loading`). A process takes the second where it is there and whole, and otherwise the first.
+is loaded without it (`code_loading`). A process takes the second where it is there and whole, and otherwise the first;
+what is missing or damaged is then made anew.
 
 Compiled code lies in a folder whose name tells sources, versions and processor apart, so what is found fits. It is made
 once: by `pnu doctor --install` (so by `make setup`), or in the background by a process of low priority, which the first
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
 HERE = Path(__file__).parent
 KERNELS = ("boxes", "neighbors", "greedy_sampling", "frames", "projector", "dipoles", "planes", "pushes")
-COMPLETE, LOCK, FAILED, CODE = "complete", "lock", "failed", "code"
+COMPLETE, LOCK, FAILED, CODE, NO_CODE = "complete", "lock", "failed", "code", "no_code"
 OLD = 30 * 86400  # seconds
 EXACT = {"nnan", "ninf", "nsz"}  # results have the bits of NumPy's operations in the order written
 LOOSE = {"nnan", "ninf", "nsz", "arcp", "contract", "reassoc"}  # to rounding
@@ -104,37 +105,46 @@ def complete() -> bool:
     return _complete(folder())
 
 
+def wanting() -> bool:
+    """Whether something is to be compiled: kernels, or machine code that is missing or damaged and can be kept."""
+    from pnu.kernels.code_loading import intact
+
+    place = folder()
+    return place is not None and not (_complete(place) and (intact(place / CODE) or (place / NO_CODE).exists()))
+
+
 def compile_all(*, wait: bool = True) -> bool:
-    """Compile what is not compiled yet, one process at a time; whether all is now.
+    """Compile what is not compiled yet, one process at a time; whether all kernels are now.
 
     wait: for another process that is at it.
     """
     place = folder()
-    if place is None or complete():
+    if place is None or not wanting():
         return complete()
     try:
         place.mkdir(parents=True, exist_ok=True)
         with open(place / LOCK, "w") as lock:
             if not _taken(lock, wait):
-                return False
-            if not complete():
+                return complete()
+            if wanting():
                 for name in KERNELS:
                     importlib.import_module(f"pnu.kernels.{name}")
                 _keep_code(place)
                 (place / COMPLETE).touch()
                 _forget_old(place)
     except Exception as error:  # a compiler can fail in many ways, and nobody needs it
-        _note(place, error)
-        return False
-    return True
+        _note(place / FAILED, error)
+    return complete()
 
 
 def _keep_code(place: Path) -> None:
     """Machine code beside numba's files; where that cannot be, processes start a second later."""
     from pnu.kernels import code_writing
 
-    with contextlib.suppress(Exception):
+    try:
         code_writing.write_code(place / CODE, _made)
+    except Exception as error:
+        _note(place / NO_CODE, error)
 
 
 def reason() -> str | None:
@@ -152,7 +162,7 @@ def compile_in_background() -> None:
     """Compile in a process of low priority that outlives this one, at most one a machine, and once if it fails."""
     place = folder()
     unwanted = os.environ.get("PNU_FAST") == "0" or os.environ.keys() & {"CI", "PYTEST_VERSION"}
-    if place is None or unwanted or complete() or (place / FAILED).exists():
+    if place is None or unwanted or not wanting() or (place / FAILED).exists():
         return
     with contextlib.suppress(OSError):
         _start()
@@ -187,9 +197,9 @@ def _taken(lock: Any, wait: bool) -> bool:
     return True
 
 
-def _note(place: Path, error: Exception) -> None:
+def _note(path: Path, error: Exception) -> None:
     with contextlib.suppress(OSError):
-        (place / FAILED).write_text(f"{type(error).__name__}: {error}\n")
+        path.write_text(f"{type(error).__name__}: {error}\n")
 
 
 def _key() -> str:

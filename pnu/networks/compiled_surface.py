@@ -45,8 +45,8 @@ class CompiledSurface:
     neighbors: int
     reach: int
     seeds: float
-    candidates: float
-    shortlist: float
+    candidates: float | None
+    shortlist: float | None
     relaxation: int
     refinements: int
     reject: float
@@ -147,8 +147,9 @@ def read_compiled(source: str | PathLike[str]) -> CompiledSurface | None:
 
 def _sound(settings: Mapping[str, Any]) -> bool:
     """Whether the network takes these settings; what it does not, it says itself."""
-    numbers = all(isinstance(settings[name], int | float) for name in SETTINGS)
-    one = ("seeds", "candidates", "shortlist", "refinements")
+    by_case = {name for name in ("candidates", "shortlist") if settings[name] is None}
+    numbers = all(isinstance(settings[name], int | float) for name in {*SETTINGS} - by_case)
+    one = {"seeds", "candidates", "shortlist", "refinements"} - by_case
     return (
         numbers
         and 4 <= settings["neighbors"] <= settings["reach"]

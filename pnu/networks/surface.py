@@ -82,8 +82,9 @@ class Surface(nn.Module):
         width: of the network
         rounds: projections in training; at work there are 1 + refinements
         seeds: seeds for each point wanted
-        candidates: of them, after thinning out evenly (no input points stay: 2 at most); each moves to a sphere
-        shortlist: of those, thinned out again after they moved (1.15 at most there); the network projects these
+        candidates: of them, after thinning out evenly; each moves to a sphere. null: 3 where input points stay, else 2
+        shortlist: of those, thinned out again after they moved; the network projects these. null: 2 where input points
+            stay, else 1.15
         relaxation: steps of even spacing; 0: none
         refinements: projections after the even spacing; one more is nearer to the surface and a little less even
         reject: share of points made too many; the worst of their surroundings by expected error are dropped
@@ -104,7 +105,7 @@ class Surface(nn.Module):
 
     def __init__(
         self, ratio: int = 4, neighbors: int = 24, reach: int = 24, width: int = 64, rounds: int = 2,
-        seeds: float = 4, candidates: float = 3, shortlist: float = 2,
+        seeds: float = 4, candidates: float | None = None, shortlist: float | None = None,
         relaxation: int = 2, refinements: int = 2, reject: float = 0.003, slide: float = 1.0,
         queries: int = 64, smoothing: float = 0.0, refining: float = 0.0, passes: int = 0,
         sphere: bool = True, attention: bool = True,
@@ -118,8 +119,9 @@ class Surface(nn.Module):
         if reject < 0:
             raise ValueError(f"model.reject={reject}: expected a share of the points, 0 or more")
         for name in ("rounds", "seeds", "candidates", "shortlist", "refinements", "queries"):
-            if getattr(self, name) < 1:  # too few seeds would be too few points
-                raise ValueError(f"model.{name}={getattr(self, name)}: expected at least 1")
+            number = getattr(self, name)
+            if number is not None and number < 1:  # too few seeds would be too few points
+                raise ValueError(f"model.{name}={number}: expected at least 1")
         for name, share in (("smoothing", smoothing), ("refining", refining), ("slide", slide)):
             if not 0 <= share <= 1:
                 raise ValueError(f"model.{name}={share}: expected a share from 0 to 1")

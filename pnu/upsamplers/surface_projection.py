@@ -51,7 +51,8 @@ LONG = 10_000  # points made from which on a computation takes long enough to ha
 SPACED = 6  # neighbors whose mean distance is the spacing at a point of the cloud,
 COVERED = 0.5  # of which so much may lie between it and the nearest point made;
 NEARER, APPROACHES = 0.9, 3  # that comes to this share of it, again where another lost its own
-FEW = 2, 1.15  # candidates and shortlist, at most, where no points stay, or where the surface goes on beyond a part
+MANY = 3, 2  # candidates and shortlist where points stay,
+FEW = 2, 1.15  # where none do, or where the surface goes on beyond a part
 CLOSE = 12  # neighbors of the sphere that candidates are first moved to
 
 
@@ -118,10 +119,9 @@ class SurfaceProjection:
             return context.parts.get(name, lambda: compute(partial(context.progress, name)))
 
         each = max(1, round(network.seeds * new / first))
-        chosen_from = network.candidates, network.shortlist
-        if part or not len(kept):
-            chosen_from = min(chosen_from[0], FEW[0]), min(chosen_from[1], FEW[1])
-        candidates, some, more = (round(share * new) for share in (*chosen_from, 1 + network.reject))
+        usual = MANY if len(kept) and not part else FEW
+        shares = network.candidates or usual[0], network.shortlist or usual[1], 1 + network.reject
+        candidates, some, more = (round(share * new) for share in shares)
         query = named("seeds", lambda step: seeds_around(cloud, each, candidates, step, first=first))
         if starts_on_spheres(network):
             to_sphere = partial(spheres, batch_size=context.batch_size)

@@ -1,15 +1,19 @@
 """Compiled steps of the surface model against those of torch: frames, spheres, network, whole clouds."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
 
 import pnu
+from pnu import weights
 from pnu.fast.compiled_projector import compiled_projection, compiled_spheres
 from pnu.geometry.local_frames import feet
 from pnu.geometry.neighbor_search import Search
 from pnu.networks import checkpoints
+from pnu.networks.compiled_surface import read_compiled
 from pnu.networks.surface import Projector, Surface
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -141,3 +145,15 @@ def test_threads_do_not_change_a_bit() -> None:
     finally:
         torch.set_num_threads(before)
     np.testing.assert_array_equal(*found)
+
+
+@pytest.mark.parametrize(("share", "taken"), [(None, True), (2.5, True), (0.5, False), ("many", False)])
+def test_only_settings_that_the_network_takes_are_read_without_torch(
+    tmp_path: Path, share: object, taken: bool
+) -> None:
+    found = weights.read(weights.find("surface"))
+    path = tmp_path / "a.safetensors"
+    weights.write(path, found.model | {"candidates": share, "shortlist": share}, found.state)
+    compiled = read_compiled(path)
+    assert (compiled is not None) == taken
+    assert compiled is None or compiled.candidates == compiled.shortlist == share

@@ -100,24 +100,23 @@ def test_equal_maxima_share_the_gradient(monkeypatch: pytest.MonkeyPatch) -> Non
 
 @pytest.mark.parametrize("depth", [1, 3])
 @pytest.mark.parametrize("training", [False, True])
-def test_differences_of_tables_equal_layers(monkeypatch: pytest.MonkeyPatch, training: bool, depth: int) -> None:
-    """Rows that are made where they are needed, of points and centers, against rows that are stored."""
+def test_gathered_rows_equal_layers(monkeypatch: pytest.MonkeyPatch, training: bool, depth: int) -> None:
+    """Rows that are made where they are needed, of a table and offsets, against rows that are stored."""
     network = mlp(*(7, 16, 12, 20)[: depth + 1]).train(training)
     idx = neighbors(3, 40, 50, 8)
     table = torch.randn(150, 16, dtype=torch.float64, requires_grad=True)
-    centers = torch.randn(120, 16, dtype=torch.float64, requires_grad=True)
+    points = torch.randn(150, 3, dtype=torch.float64, requires_grad=True)
 
     def both(groups: Neighborhoods) -> list[Tensor]:
         copied = copy.deepcopy(network)
         with torch.set_grad_enabled(training):
-            output = through(copied, table, projected=True, groups=groups, centers=centers)
+            offsets = points[groups.source] - points[groups.owner]
+            output = through(copied, table, projected=True, groups=groups, offsets=offsets)
         if not training:
             return [output]
         weight = torch.linspace(-1, 1, output.numel(), dtype=torch.float64).view_as(output)
-        parameters = [
-            p for name, p in copied.named_parameters() if "linear.bias" not in name and name != "0.linear.weight"
-        ]
-        gradients = torch.autograd.grad((output * weight).sum(), [table, centers, *parameters])
+        parameters = [p for name, p in copied.named_parameters() if "linear.bias" not in name]
+        gradients = torch.autograd.grad((output * weight).sum(), [table, points, *parameters])
         return [output.detach(), *gradients, *copied.buffers()]
 
     found = both(distinct(idx, 50))
@@ -338,7 +337,27 @@ def test_a_fast_part_equals_the_plain_one(name: str, clouds: int, n: int, mode: 
         assert type(fast) is FORMS[type(part)]
         found = values_of(fast, lambda network: run(network, x), x)
     # in float32 batch norm magnifies the rounding of columns that hardly vary, on each processor in another way
-    assert_equal(found, expected, 1e-9 if dtype == torch.float64 else 2e-2 if mode == "training" else 1e-4)
+    assert_equal(found, expected, 1e-9 if dtype == torch.float64 else 1e-3 if mode == "training" else 1e-4)
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_a_fast_part_is_as_exact_as_the_plain_one(name: str) -> None:
+    """In float32 training, against float64, at the worst of several sizes."""
+    worst = {"plain": 0.0, "fast": 0.0}
+    for clouds, n in [(1, 16), (3, 50), (2, 201)]:
+        torch.manual_seed(0)
+        part, run = PARTS[name]()
+        x = cloud(clouds, n).double().requires_grad_()
+        exact = values_of(shaken(part).double(), lambda network, run=run, x=x: run(network, x), x)
+        x = x.detach().float().requires_grad_()
+        for form in worst:
+            network = accelerate(part.float()) if form == "fast" else part.float()
+            found = values_of(network, lambda network, run=run, x=x: run(network, x), x)
+            for value, truth in zip(found.values(), exact.values(), strict=True):
+                if value.numel():
+                    error = (value - truth).abs().max() / truth.abs().max().clamp_min(1)
+                    worst[form] = max(worst[form], float(error))
+    assert worst["fast"] < 5 * worst["plain"]
 
 
 NETWORKS = {

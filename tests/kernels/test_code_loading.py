@@ -113,10 +113,19 @@ print("numba" in sys.modules)
 """
 
 
+MENDED = """
+import sys
+from pathlib import Path
+from pnu.kernels import compilation
+compilation.folder = lambda: Path(sys.argv[1])
+print(compilation.compile_all(wait=False))
+"""
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("compiled")
 @pytest.mark.parametrize("damage", ["none", "cut off", "missing"])
-def test_numba_answers_where_code_is_damaged(tmp_path: Path, damage: str) -> None:
+def test_numba_answers_where_code_is_damaged_which_is_then_mended(tmp_path: Path, damage: str) -> None:
     path = tmp_path / "kernels" / compilation.CODE
     shutil.copytree(kept().parent, path.parent)
     if damage == "cut off":
@@ -124,6 +133,8 @@ def test_numba_answers_where_code_is_damaged(tmp_path: Path, damage: str) -> Non
     elif damage == "missing":
         path.unlink()
     assert run(DAMAGED, path.parent).split() == [str(damage != "none")]
+    assert run(MENDED, path.parent).split() == ["True"]
+    assert run(DAMAGED, path.parent).split() == ["False"]
 
 
 REFUSED = """

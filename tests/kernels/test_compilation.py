@@ -1,5 +1,6 @@
 """Where compiled kernels are kept: what is found, what is not, and that nothing of it is an error."""
 
+import hashlib
 import importlib.util
 import os
 import shutil
@@ -16,15 +17,15 @@ from pnu.commands.doctor import kernels_line
 from pnu.kernels import compilation
 
 KERNEL = "KERNELS", ("boxes",)
+NOTHING = hashlib.sha256().digest()  # an intact file of no code
 
 
 @pytest.fixture
 def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A machine on which nothing is compiled, and where compiling means to import one file that is."""
     monkeypatch.setattr(compilation, "folder", lambda: tmp_path / "kernels-new")
-    monkeypatch.setattr("pnu.commands.doctor.folder", compilation.folder)
     monkeypatch.setattr(compilation, *KERNEL)
-    monkeypatch.setattr("pnu.kernels.code_writing.write_code", lambda path, kernels: path.touch())
+    monkeypatch.setattr("pnu.kernels.code_writing.write_code", lambda path, kernels: path.write_bytes(NOTHING))
     yield tmp_path / "kernels-new"
     compilation._start.cache_clear()
 
@@ -75,10 +76,42 @@ def test_nothing_is_compiled_in_the_background_where(
 ) -> None:
     if why in ("compiled", "failed"):
         empty.mkdir()
-        (empty / (compilation.COMPLETE if why == "compiled" else compilation.FAILED)).touch()
+        for name in (compilation.COMPLETE, compilation.NO_CODE) if why == "compiled" else (compilation.FAILED,):
+            (empty / name).touch()
     else:
         monkeypatch.setenv(*{"PNU_FAST=0": ("PNU_FAST", "0"), "a test": ("PYTEST_VERSION", "9")}[why])
     compilation.compile_in_background()
+    assert begun == []
+
+
+@pytest.mark.parametrize("damage", ["cut off", "changed", "missing"])
+def test_damaged_code_is_written_anew(empty: Path, begun: list[list[str]], damage: str) -> None:
+    """By a process in the background, and by the doctor; kernels answer all the while."""
+    assert compilation.compile_all()
+    code = empty / compilation.CODE
+    code.unlink() if damage == "missing" else code.write_bytes(NOTHING[:-1] if damage == "cut off" else NOTHING + b"1")
+    assert kernels.ready()
+    assert kernels_line(install=False).endswith("missing or damaged: pnu doctor --install writes it anew.")
+    compilation.compile_in_background()
+    assert len(begun) == 1
+    assert kernels_line(install=True) == "Compiled kernels are here."
+    assert code.read_bytes() == NOTHING
+
+
+def test_code_that_cannot_be_kept_is_tried_once(
+    empty: Path, begun: list[list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(path: Path, kernels: object) -> None:
+        tried.append(path)
+        raise NotImplementedError("not here")
+
+    tried: list[Path] = []
+    monkeypatch.setattr("pnu.kernels.code_writing.write_code", refused)
+    for _ in range(2):
+        assert compilation.compile_all()
+        compilation.compile_in_background()
+    assert kernels_line(install=False) == "Compiled kernels are here."
+    assert len(tried) == 1
     assert begun == []
 
 
@@ -93,8 +126,7 @@ def test_one_process_compiles(empty: Path) -> None:
 def test_where_nothing_can_be_written_nothing_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     assert compilation.folder.__wrapped__() is None
-    for module in ("pnu.kernels.compilation", "pnu.commands.doctor"):
-        monkeypatch.setattr(f"{module}.folder", lambda: None)
+    monkeypatch.setattr(compilation, "folder", lambda: None)
     assert not compilation.compile_all()
     assert not kernels.ready()
     compilation.compile_in_background()

@@ -366,6 +366,27 @@ def test_bent_and_thin_parts_get_as_many_points_for_their_surface_as_flat_ones()
     assert float(uniformity(dense[:, :3], truth[:, :3], share=0.03)) < 0.06
 
 
+@pytest.mark.parametrize("keep", [True, False])
+@pytest.mark.parametrize(
+    ("settings", "staying", "elsewhere"),
+    [
+        ({}, (3, 2), (2, 1.15)),
+        ({"candidates": 2.5}, (2.5, 2), (2.5, 1.15)),
+        ({"candidates": 4, "shortlist": 1.5}, (4, 1.5), (4, 1.5)),
+    ],
+)
+def test_numbers_that_are_given_count_everywhere(
+    settings: dict[str, float], staying: tuple[float, float], elsewhere: tuple[float, float], keep: bool
+) -> None:
+    """Of candidates and of the shortlist; those that are not depend on whether points stay."""
+    totals: dict[str, int] = {}
+    upsample(
+        Surface(**settings), sphere(300), 900, keep=keep, progress=lambda stage, _, total: totals.update({stage: total})
+    )
+    new = 900 - keep * 300
+    assert (totals["spheres"] / new, totals["projection"] / new) == (staying if keep else elsewhere)
+
+
 @pytest.mark.parametrize("name", ["rounds", "seeds", "candidates", "shortlist", "refinements"])
 def test_less_than_one_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match=rf"model\.{name}=0: expected at least 1"):
