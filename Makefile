@@ -49,7 +49,7 @@ board: $(STAMP)   ## TensorBoard over outputs/
 	@$(BIN)/pnu doctor --require
 	$(BIN)/tensorboard --logdir outputs $(ARGS)
 
-bench: $(STAMP)   ## measure speed, as ratios to named alternatives
+bench: $(STAMP)   ## measure speed, as ratios to named alternatives; fails where one is 10 % worse than committed
 	$(BIN)/python -m bench $(ARGS)
 
 docs: $(STAMP)   ## the documentation as a site, in build/docs; a warning is an error

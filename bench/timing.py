@@ -1,9 +1,12 @@
 """Ratios of run times: contestants run in turn, A B A B, so that a drift of the machine's speed hits all alike."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from statistics import median
+from typing import Any
+
+LIMIT = 1.1  # times as long beside an alternative as committed, and ours counts as slower
 
 
 @dataclass(frozen=True)
@@ -36,3 +39,24 @@ def compare(name: str, contestants: Mapping[str, Callable[[], object]], *, round
             run()
             taken[contestant].append(time.perf_counter() - started)
     return Row(name, {contestant: median(values) for contestant, values in taken.items()})
+
+
+def entries(rows: Iterable[Row], made: str) -> dict[str, Any]:
+    """The ratios of rows as they are committed, of several the lowest, each with what it was made with."""
+    lowest: dict[str, float] = {}
+    for name, ratio in _ratios(rows):
+        lowest[name] = min(ratio, lowest.get(name, ratio))
+    return {name: {"ratio": round(ratio, 3), "made": made} for name, ratio in lowest.items()}
+
+
+def slower(rows: Iterable[Row], committed: Mapping[str, Any]) -> dict[str, float]:
+    """By the names of `entries`: how many times as long ours takes beside an alternative, where more than LIMIT.
+
+    A ratio that is not committed is not judged.
+    """
+    factors = {name: committed[name]["ratio"] / ratio for name, ratio in _ratios(rows) if name in committed}
+    return {name: factor for name, factor in factors.items() if factor > LIMIT}
+
+
+def _ratios(rows: Iterable[Row]) -> Iterator[tuple[str, float]]:
+    return ((f"{row.name}, beside {other}", ratio) for row in rows for other, ratio in row.ratios.items())
