@@ -2,7 +2,7 @@
 
 The table, and the machine it was made on, go to outputs/bench/ as Markdown and JSON. Every figure is a ratio of medians
 of runs taken in turn (`bench.timing`). Where ours takes more than 10 % longer beside an alternative than the committed
-table says, twice in a row, that is said and the exit code is 1; `--commit` writes the ratios there.
+table says, twice in a row, that is said and the exit code is 1; `--commit` measures twice and writes the lower ratios.
 """
 
 import argparse
@@ -67,8 +67,8 @@ def measured(measure: Callable[[], Iterable[Row]], committed: dict[str, Any]) ->
         rows = told(measure())
         worse = {key: factor for key, factor in slower(rows, committed).items() if key in worse}
     return rows, [
-        f"- {row}: {factor:.2f} times as long beside {other} as committed ({committed[row]['made']})"
-        for (row, other), factor in worse.items()
+        f"- {name}: {factor:.2f} times as long as committed ({committed[name]['made']})"
+        for name, factor in worse.items()
     ]
 
 
@@ -89,7 +89,9 @@ def main() -> None:
     parser.add_argument("--models", nargs="+", default=["surface"], help="of the scale curve: surface pnu ...")
     parser.add_argument("--keep", action="store_true", help="the last dense cloud of the curve, as ply in the folder")
     parser.add_argument("--folder", type=Path, default=Path("outputs/bench"), help="for table and plot")
-    parser.add_argument("--commit", action="store_true", help=f"write the ratios to bench/{COMMITTED.name}")
+    parser.add_argument(
+        "--commit", action="store_true", help=f"write the ratios, the lower of two, to bench/{COMMITTED.name}"
+    )
     arguments = parser.parse_args()
     unknown = set(arguments.parts) - {*PARTS, "scale"}
     if unknown:
@@ -102,11 +104,13 @@ def main() -> None:
     rows: list[Row] = []
     notes: list[str] = []
     worse: list[str] = []
+    again: list[Row] = []
     for name, measure in PARTS.items():
         if name in wanted:
             found, lines = measured(measure, {} if arguments.commit else committed)
             rows += found
             worse += lines
+            again += told(measure()) if arguments.commit else []
     profile = step.profile() if "step" in wanted else None
     if profile:
         notes += ["", *profile.lines()]
@@ -118,7 +122,7 @@ def main() -> None:
     if worse:
         notes += ["", f"Slower than committed by more than {LIMIT - 1:.0%}:", "", *worse]
     if arguments.commit:
-        write_json(COMMITTED, (committed if arguments.parts else {}) | entries(rows, known["made"]))
+        write_json(COMMITTED, (committed if arguments.parts else {}) | entries([*rows, *again], known["made"]))
     table = markdown(known, rows, notes)
     stem = "bench" if not arguments.parts else "_".join(wanted)
     with atomic_path(arguments.folder / f"{stem}.md") as path:

@@ -8,7 +8,7 @@ happens after it:
   as a CUDA graph, and where its time goes
 - `upsample`: shipped models on the GPU beside the CPU
 - `schedule`: trains the paper's network (`scale=full`) for the minutes that are left, with checkpoints, in FOLDER/run;
-  whole batches are cut on the GPU, the step is captured, and the rate follows the time
+  the step is captured, and the rate follows the time
 
 `--device cpu --small` tries all of it without a GPU, in a minute or two; the numbers then mean nothing.
 """

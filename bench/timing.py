@@ -1,7 +1,7 @@
 """Ratios of run times: contestants run in turn, A B A B, so that a drift of the machine's speed hits all alike."""
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from statistics import median
 from typing import Any
@@ -42,20 +42,21 @@ def compare(name: str, contestants: Mapping[str, Callable[[], object]], *, round
 
 
 def entries(rows: Iterable[Row], made: str) -> dict[str, Any]:
-    """Ratios of rows as they are committed, by name, with what they were made with."""
-    return {row.name: {"made": made, "ratios": {k: round(v, 3) for k, v in row.ratios.items()}} for row in rows}
+    """The ratios of rows as they are committed, of several the lowest, each with what it was made with."""
+    lowest: dict[str, float] = {}
+    for name, ratio in _ratios(rows):
+        lowest[name] = min(ratio, lowest.get(name, ratio))
+    return {name: {"ratio": round(ratio, 3), "made": made} for name, ratio in lowest.items()}
 
 
-def slower(rows: Iterable[Row], committed: Mapping[str, Any]) -> dict[tuple[str, str], float]:
-    """By row and alternative: how many times as long ours takes beside it as in `entries`, where more than LIMIT.
+def slower(rows: Iterable[Row], committed: Mapping[str, Any]) -> dict[str, float]:
+    """By the names of `entries`: how many times as long ours takes beside an alternative, where more than LIMIT.
 
-    A ratio that is not among them is not judged.
+    A ratio that is not committed is not judged.
     """
-    found = {}
-    for row in rows:
-        before = committed.get(row.name, {"ratios": {}})["ratios"]
-        for other, ratio in row.ratios.items():
-            factor = before.get(other, 0) / ratio
-            if factor > LIMIT:
-                found[row.name, other] = factor
-    return found
+    factors = {name: committed[name]["ratio"] / ratio for name, ratio in _ratios(rows) if name in committed}
+    return {name: factor for name, factor in factors.items() if factor > LIMIT}
+
+
+def _ratios(rows: Iterable[Row]) -> Iterator[tuple[str, float]]:
+    return ((f"{row.name}, beside {other}", ratio) for row in rows for other, ratio in row.ratios.items())

@@ -187,7 +187,7 @@ def _backward(
     tl.store(out + place, scale[None, :] * (behind - of_mean[None, :] - normed * of_product[None, :]), kept)
 
 
-def tile(width: int) -> tuple[int, int]:
+def norm_tile(width: int) -> tuple[int, int]:
     """Rows and columns of a tile."""
     columns = min(WIDTHS, triton.next_power_of_2(width))
     return TILE // columns, columns
@@ -195,7 +195,7 @@ def tile(width: int) -> tuple[int, int]:
 
 def shares(rows: int, width: int) -> tuple[int, int]:
     """Rows of a program of a reduction, whole tiles, and how many programs that makes."""
-    height, columns = tile(width)
+    height, columns = norm_tile(width)
     programs = max(1, PROGRAMS // triton.cdiv(width, columns))
     per = triton.cdiv(triton.cdiv(rows, programs), height) * height
     return per, triton.cdiv(rows, per)
@@ -222,7 +222,7 @@ class _NormedReLU(torch.autograd.Function):
         ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, ahead: Tensor, norm: torch.nn.BatchNorm1d, size: int | None
     ) -> Tensor:
         rows, width = x.shape
-        height, columns = tile(width)
+        height, columns = norm_tile(width)
         blocks = triton.cdiv(width, columns)
         per, number = shares(rows, width)
         parts = torch.empty(number, 2, width, device=x.device)
@@ -251,7 +251,7 @@ class _NormedReLU(torch.autograd.Function):
         gradient = gradient.contiguous()
         (rows, width), size = x.shape, ctx.size or 1
         member = pooled[0] if pooled else gradient  # which is then not read
-        height, columns = tile(width)
+        height, columns = norm_tile(width)
         blocks = triton.cdiv(width, columns)
         per, number = shares(len(gradient), width)
         parts = torch.empty(number, 2, width, device=x.device)

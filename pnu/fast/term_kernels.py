@@ -106,7 +106,7 @@ def _add(place, x, y, z, a, b, c, kept):
     tl.atomic_add(place + 5, c, kept, sem="relaxed")
 
 
-def sums(prediction: Tensor, neighbors: Tensor, absolute: bool, tiny: float) -> Tensor:
+def neighborhood_sums(prediction: Tensor, neighbors: Tensor, absolute: bool, tiny: float) -> Tensor:
     """As `terms.sums`: prediction (B, m, 6) float32, neighbors (B, m, k) int64 -> (3,)."""
     apply: Callable[..., Tensor] = _Sums.apply
     return apply(prediction.contiguous(), neighbors.contiguous(), absolute, tiny)

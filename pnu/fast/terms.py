@@ -26,7 +26,9 @@ class CompoundLoss(compound.CompoundLoss):
         if prediction.shape[-1] != 6 or (prediction.device.type != "cpu" and on_gpu is None):
             return super().neighborhood_terms(prediction, neighbors)
         count = neighbors.numel() if self.reduction == "mean" else len(neighbors)
-        values = (on_gpu.sums if on_gpu else sums)(prediction, neighbors, self.absolute, compound.TINY) / count
+        values = (on_gpu.neighborhood_sums if on_gpu else sums)(
+            prediction, neighbors, self.absolute, compound.TINY
+        ) / count
         return dict(zip(("point_knn", "normal_orth", "normal_knn"), values, strict=True))
 
 

@@ -97,7 +97,7 @@ def test_terms_are_those_of_the_loss(absolute: bool) -> None:
     neighbors[0, 3, 0] = 4
     weights = torch.tensor([0.3, -1.2, 0.7])
     reference, given = cloud.double().requires_grad_(), cloud.clone().to(DEVICE).requires_grad_()
-    found = term_kernels.sums(given, neighbors.to(DEVICE), absolute, compound.TINY)
+    found = term_kernels.neighborhood_sums(given, neighbors.to(DEVICE), absolute, compound.TINY)
     around = reference[torch.arange(2)[:, None, None], neighbors]
     expected = len(cloud) * torch.stack(
         [
@@ -181,7 +181,7 @@ def compiled(kernel, types, warps=4, **constants):
     print(len(built.asm["cubin"]))
 
 for width in (16, 512):
-    rows, columns = norm.tile(width)
+    rows, columns = norm.norm_tile(width)
     block = dict(ROWS=rows, COLUMNS=columns)
     for x in (FLOAT, "*bf16"):
         compiled(norm._statistics, [x, FLOAT, NUMBER, NUMBER, NUMBER], **block)
