@@ -86,6 +86,16 @@ def _finish(
 
 
 @triton.jit
+def _statistics_of(saved, columns, wide, width):
+    """What `_finish` has saved: mean, inverse of the deviation, factor and summand."""
+    mean = tl.load(saved + columns, wide, 0.0)
+    inverse = tl.load(saved + width + columns, wide, 0.0)
+    scale = tl.load(saved + 2 * width + columns, wide, 0.0)
+    summand = tl.load(saved + 3 * width + columns, wide, 0.0)
+    return mean, inverse, scale, summand
+
+
+@triton.jit
 def _normed(x, saved, row, columns, kept, wide, width):
     """Rows after the norm."""
     scale = tl.load(saved + 2 * width + columns, wide, 0.0)
@@ -136,10 +146,7 @@ def _sums(
     wide = columns < width
     first = tl.program_id(0).to(tl.int64) * per
     last = tl.minimum(first + per, rows)
-    mean = tl.load(saved + columns, wide, 0.0)
-    inverse = tl.load(saved + width + columns, wide, 0.0)
-    scale = tl.load(saved + 2 * width + columns, wide, 0.0)
-    summand = tl.load(saved + 3 * width + columns, wide, 0.0)
+    mean, inverse, scale, summand = _statistics_of(saved, columns, wide, width)
     total = tl.zeros((ROWS, COLUMNS), tl.float32)
     product = tl.zeros((ROWS, COLUMNS), tl.float32)
     for start in range(0, per, ROWS):
@@ -168,10 +175,7 @@ def _backward(
     wide = columns < width
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     kept = (row < rows)[:, None] & wide[None, :]
-    mean = tl.load(saved + columns, wide, 0.0)
-    inverse = tl.load(saved + width + columns, wide, 0.0)
-    scale = tl.load(saved + 2 * width + columns, wide, 0.0)
-    summand = tl.load(saved + 3 * width + columns, wide, 0.0)
+    mean, inverse, scale, summand = _statistics_of(saved, columns, wide, width)
     of_mean = tl.load(sums + columns, wide, 0.0) / rows
     of_product = tl.load(sums + width + columns, wide, 0.0) / rows
     place = row[:, None] * width + columns[None, :]

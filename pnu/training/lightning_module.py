@@ -203,7 +203,8 @@ class UpsamplingModule(pl.LightningModule):
         names = list(self.micro_batches[0][0])
         found = torch.stack([values[name].to(norm) for values, _ in self.micro_batches for name in names])
         found = found.view(-1, len(names))
-        clock = norm.new_tensor(time.monotonic() - self.started_at)
+        # written on the device itself: a copy to it would wait for all that it has to do
+        clock = torch.full_like(norm, time.monotonic() - self.started_at)
         means = self.trainer.strategy.reduce(torch.cat([found.mean(0), norm[None], clock[None]]), reduce_op="mean")
         self.unread.append(
             StepValues(
@@ -324,15 +325,10 @@ class UpsamplingModule(pl.LightningModule):
     def optimizer_of(self, parameters: Iterator[nn.Parameter]) -> torch.optim.Optimizer:
         """The optimizer; on a GPU in one kernel for all parameters, where it has one and no scaler is in its way."""
         assert self.optimizer is not None
-        made = getattr(self.optimizer, "func", self.optimizer)
-        fused = self.device.type == "cuda" and self.trainer.precision != "16-mixed"
-        if (
-            fused
-            and "fused" in inspect.signature(made).parameters
-            and "fused" not in getattr(self.optimizer, "keywords", {})
-        ):
-            return self.optimizer(parameters, fused=True)
-        return self.optimizer(parameters)
+        known = inspect.signature(getattr(self.optimizer, "func", self.optimizer)).parameters
+        given = getattr(self.optimizer, "keywords", {})
+        fused = self.device.type == "cuda" and self.trainer.precision != "16-mixed" and "fused" in known.keys() - given
+        return self.optimizer(parameters, **({"fused": True} if fused else {}))
 
     def scheduled(self, optimizer: torch.optim.Optimizer) -> OptimizerLRScheduler:
         """An optimizer, with its schedule where there is one."""

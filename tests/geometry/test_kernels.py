@@ -1,8 +1,5 @@
 """Triton kernels against their slow twins: on a GPU where there is one, in Triton's interpreter elsewhere."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -10,6 +7,7 @@ import torch
 from torch import Tensor
 
 from pnu.geometry import neighbor_search, sampling
+from tests.ahead import machine_code_sizes
 
 try:
     from pnu.geometry import triton_kernels
@@ -193,37 +191,13 @@ def test_searches_take_the_kernels(monkeypatch: pytest.MonkeyPatch, kind: str) -
 @pytest.mark.parametrize("capability", [80, 90])
 def test_kernels_compile_for_a_gpu_that_is_not_here(capability: int, tmp_path: Path) -> None:
     """Each kernel, in the sizes at its bounds, down to the machine code of an A100 and an H100."""
-    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
-    environment["TRITON_CACHE_DIR"] = str(tmp_path)
-    made = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", AHEAD.format(capability=capability)],
-        env=environment, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    if "nothing compiles here" in made.stderr:
-        pytest.skip(made.stderr.strip())
-    assert made.returncode == 0, made.stderr
-    sizes = [int(line) for line in made.stdout.split()]
+    sizes = machine_code_sizes(AHEAD, capability, tmp_path)
     assert len(sizes) == 9
     assert min(sizes) > 1000
 
 
 AHEAD = """
-import sys
-import triton
-from triton.backends.compiler import GPUTarget
-from triton.compiler import ASTSource
 from pnu.geometry import triton_kernels as kernels
-
-if "nvidia" not in triton.backends.backends:
-    sys.exit("nothing compiles here: this Triton has no NVIDIA backend")
-FLOAT, INDEX = "*fp32", "*i64"
-
-def compiled(kernel, types, warps=4, **constants):
-    names = kernel.arg_names
-    signature = dict(zip(names, [*types, *["constexpr"] * len(constants)], strict=True))
-    source = ASTSource(kernel, signature=signature, constexprs=constants)
-    built = triton.compile(source, target=GPUTarget("cuda", {capability}, 32), options=dict(num_warps=warps))
-    print(len(built.asm["cubin"]))
 
 for k in (1, 2):
     rows, columns = kernels.NEAREST_BLOCK

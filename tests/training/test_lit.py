@@ -3,6 +3,7 @@
 import functools
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import lightning.pytorch as pl
@@ -368,12 +369,12 @@ class Nearness(nn.Module):
 
 
 def test_one_transfer_a_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each float(tensor), item or tolist of a value waits for the device."""
+    """Each float(tensor), item or tolist of a value waits for the device, and so does a number that is sent to it."""
     asked: list[str] = []
     lit = module()
     lit.loss = Nearness()
     monkeypatch.setattr(lit, "log_dict", lambda *_, **__: None)  # of the CPU
-    for name in ("item", "tolist", "__float__", "__bool__", "__int__"):
+    for name in ("item", "tolist", "__float__", "__bool__", "__int__", "new_tensor"):
         plain = getattr(Tensor, name)
 
         def call(self: Tensor, *arguments: Any, name: str = name, plain: Any = plain) -> Any:
@@ -396,6 +397,27 @@ def test_one_transfer_a_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         monkeypatch.setattr(lit, name, watched)
     trainer(tmp_path, accumulate_grad_batches=2, max_steps=3, max_epochs=-1).fit(lit, loader(8), loader(2))
     assert asked == ["tolist"] * 3
+
+
+@pytest.mark.parametrize(
+    ("device", "precision", "options", "fused"),
+    [
+        ("cuda", "32-true", {}, True),
+        ("cuda", "32-true", {"fused": False}, False),
+        ("cuda", "16-mixed", {}, None),
+        ("cpu", "32-true", {}, None),
+    ],
+)
+def test_on_a_gpu_the_optimizer_is_one_kernel(
+    device: str, precision: str, options: dict[str, Any], fused: bool | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Unless one says otherwise, and not under a gradient scaler, which it would not go with."""
+    monkeypatch.setattr(UpsamplingModule, "device", torch.device(device))
+    monkeypatch.setattr(UpsamplingModule, "trainer", SimpleNamespace(precision=precision))
+    lit = module(optimizer=functools.partial(torch.optim.Adam, lr=1e-3, **options))
+    assert lit.optimizer_of(lit.parameters()).defaults["fused"] is fused
+    lit.optimizer = functools.partial(torch.optim.Rprop, lr=1e-3)  # which has no such form
+    assert "fused" not in lit.optimizer_of(lit.parameters()).defaults
 
 
 def test_mixed_precision_trains(tmp_path: Path) -> None:
