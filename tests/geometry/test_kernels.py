@@ -43,7 +43,7 @@ def test_knn_takes_the_first_of_equal_points() -> None:
     assert idx.tolist() == [[[0, 1, 2]]]
 
 
-@pytest.mark.parametrize("k", [2, 9])
+@pytest.mark.parametrize("k", [2, pytest.param(9, marks=pytest.mark.slow)])
 def test_knn_of_many_equal_distances(k: int) -> None:
     """Three places of fifty points each: more are as near as the k-th than a kernel has room for."""
     places = cloud(2, 3)
