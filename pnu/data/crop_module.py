@@ -19,12 +19,14 @@ class ProjectionDataModule(EpochDataModule):
         procedural: train on the procedural shapes
         validation: names of the meshes kept for validation and test
         normals: of the input: given, estimated from its points, or mixed
+        sides: of estimated normals: true, or found as at work
         scans: share of the clouds that are simulated scans
         blue: share of the other clouds whose points keep a distance, as blue noise
         least: points of the smallest clouds
         noise: largest standard deviation, in radii, of the noise of clouds whose normals are estimated
         noisy: share of these clouds that has noise
         clouds: of an epoch, each drawn anew
+        pool: clouds that are drawn at all, and used again and again; null: as many as are used
         size: points of a crop
         views: crops of a cloud
         batch_size: clouds of a batch, on each device
@@ -38,10 +40,10 @@ class ProjectionDataModule(EpochDataModule):
 
     def __init__(
         self, root: str | None = None, procedural: bool = True, validation: Iterable[str] = (),
-        normals: Literal["given", "estimated", "mixed"] = "given",
+        normals: Literal["given", "estimated", "mixed"] = "given", sides: Literal["true", "found"] = "true",
         scans: float = 0.0, blue: float = 0.15, least: int = LEAST,
-        noise: float = 0.02, noisy: float = 0.5, clouds: int = 6400, size: int = 384, views: int = 2,
-        batch_size: int = 8, points: int = 2048, workers: int = 0, seed: int = 0,
+        noise: float = 0.02, noisy: float = 0.5, clouds: int = 6400, pool: int | None = None, size: int = 384,
+        views: int = 2, batch_size: int = 8, points: int = 2048, workers: int = 0, seed: int = 0,
     ) -> None:  # fmt: skip
         super().__init__(batch_size, workers, seed)
         if points < SMALLEST:
@@ -49,6 +51,7 @@ class ProjectionDataModule(EpochDataModule):
         self.evaluation_batch_size = 1
         self.root, self.procedural, self.held_out = root, procedural, list(validation)
         self.scans, self.blue, self.least, self.noise, self.noisy = scans, blue, least, noise, noisy
+        self.sides, self.pool = sides, pool
         self.normals, self.clouds, self.size, self.views, self.points = normals, clouds, size, views, points
         self.truth: MeshScene | None = None
 
@@ -80,6 +83,8 @@ class ProjectionDataModule(EpochDataModule):
             size=self.size,
             views=self.views,
             normals=self.normals,
+            sides=self.sides,
+            pool=self.pool,
             scans=self.scans,
             blue=self.blue,
             least=self.least,
@@ -88,7 +93,7 @@ class ProjectionDataModule(EpochDataModule):
             seed=self.seed,
         )
         clouds = {
-            part: WholeClouds(held_out, self.points, normals=self.normals, seed=seed)
+            part: WholeClouds(held_out, self.points, normals=self.normals, sides=self.sides, seed=seed)
             for part, seed in (("val", 1), ("test", 2))
         }
         self.datasets = {"train": train, **clouds}

@@ -1,7 +1,7 @@
 """Training data of the surface model: crops of clouds drawn from meshes, clean or noisy, normals true or estimated."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ from torch.utils.data import Dataset
 
 from pnu.data.scanner import Scanner, any_scan
 from pnu.geometry.anisotropy import averaged, thinned_lines
+from pnu.geometry.cloud_normals import settled_normals
 from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.mesh_sampling import sample_area, sample_poisson_disk
 from pnu.geometry.normal_estimation import estimate_normals, refit_normals
@@ -22,6 +23,16 @@ TAKEN = 0.015  # distance from the surface up to which a point of a scan is take
 OVERLOOKED = 0.03  # and the share of the others that stay, as where they are removed by their looks
 GIVEN = 0.3  # share of the crops that have true normals where normals="mixed"
 UNEVEN = 0.2  # share of the clouds
+HARD, WRONG = 1 / 3, 0.9  # share of the crops around points whose cosine with the true normal is below the second
+
+
+class Drawn(NamedTuple):
+    """A cloud of a mesh, with its true normals, and what an input has instead."""
+
+    shape: int  # number of the mesh
+    clean: np.ndarray  # (n, 6)
+    noisy: np.ndarray  # (n, 6)
+    rough: np.ndarray  # (n, 3) normals of the input
 
 
 class Crops(Dataset[dict[str, Any]]):
@@ -34,6 +45,10 @@ class Crops(Dataset[dict[str, Any]]):
     outside are swapped in 30 %. A share `scans` of the clouds are simulated scans (`pnu.data.scanner`), most strays
     removed and lines thinned out, as `pnu.upsample` does before the network sees them.
 
+    The sides of estimated normals are the true ones, or with sides="found" those that `settled_normals` chooses, where
+    a third of the crops is around points whose normals come out wrong. With a `pool` so many clouds are drawn and used
+    again and again, which spares the time of their normals.
+
     An item is {"input": (views, size, 6) float32 around the "center" (views, 3), "target": the same points without
     noise, "side": (views,) 1 or -1 where swapped, "index": (views,) of the mesh, "shape": its name}, all from
     (seed, epoch, index).
@@ -41,11 +56,15 @@ class Crops(Dataset[dict[str, Any]]):
 
     def __init__(
         self, meshes: dict[str, Mesh], length: int, *, size: int = 384, views: int = 2, normals: str = "given",
-        scans: float = 0.0, blue: float = 0.15, least: int = LEAST, noise: float = 0.02, noisy: float = 0.5,
-        seed: int = 0,
+        sides: str = "true", scans: float = 0.0, blue: float = 0.15, least: int = LEAST, noise: float = 0.02,
+        noisy: float = 0.5, pool: int | None = None, seed: int = 0,
     ) -> None:  # fmt: skip
         if normals not in ("given", "estimated", "mixed"):
             raise ValueError(f"data.normals={normals}: expected given, estimated or mixed")
+        if sides not in ("true", "found") or (sides == "found" and normals != "estimated"):
+            raise ValueError(f"data.sides={sides}: expected true, or found with data.normals=estimated")
+        if pool is not None and pool < 1:
+            raise ValueError(f"data.pool={pool}: expected a number of clouds, or null")
         if not 0 <= scans <= 1:
             raise ValueError(f"data.scans={scans}: expected a share from 0 to 1")
         if not 0 <= blue <= 1 - UNEVEN:
@@ -64,7 +83,8 @@ class Crops(Dataset[dict[str, Any]]):
             raise ValueError(f"data: expected clouds >= 1 and views >= 1, found {length} and {views}")
         self.names, self.meshes = list(meshes), list(meshes.values())
         self.length, self.size, self.views, self.blue, self.least = length, size, views, blue, least
-        self.noise, self.noisy = noise, noisy
+        self.noise, self.noisy, self.found_sides, self.pool = noise, noisy, sides == "found", pool
+        self.drawn: dict[int, Drawn] = {}
         self.estimated, self.mixed, self.scans, self.seed = normals != "given", normals == "mixed", scans, seed
         self.scanners = [Scanner(mesh) for mesh in self.meshes]
 
@@ -74,31 +94,53 @@ class Crops(Dataset[dict[str, Any]]):
     def __getitem__(self, key: tuple[int, int]) -> dict[str, Any]:
         epoch, index = key
         rng = np.random.default_rng((self.seed, epoch, index))
-        shape = int(rng.integers(len(self.meshes)))
-        if self.scans and rng.random() < self.scans:
-            clean, noisy = self.scanned(self.scanners[shape], rng)
+        if self.pool is None:
+            found = self.draw(rng)
         else:
-            clean, noisy = self.cloud(self.meshes[shape], rng)
-        rough = rough_normals(noisy[:, :3], clean[:, 3:]) if self.estimated else noisy[:, 3:]
-        views = [self.crop(clean, noisy, rough, rng) for _ in range(self.views)]
+            number = index % self.pool
+            if number not in self.drawn:
+                self.drawn[number] = self.draw(np.random.default_rng((self.seed, number)))
+            found = self.drawn[number]
+        shape = found.shape
+        views = [self.crop(found.clean, found.noisy, found.rough, rng) for _ in range(self.views)]
         return {
             **stacked_items(views),
             "index": torch.full((self.views,), shape),
             "shape": [self.names[shape]] * self.views,
         }
 
+    def draw(self, rng: np.random.Generator) -> Drawn:
+        """A cloud of one of the meshes."""
+        shape = int(rng.integers(len(self.meshes)))
+        if self.scans and rng.random() < self.scans:
+            clean, noisy = self.scanned(self.scanners[shape], rng)
+        else:
+            clean, noisy = self.cloud(self.meshes[shape], rng)
+        if not self.estimated:
+            return Drawn(shape, clean, noisy, noisy[:, 3:])
+        normals_of = found_normals if self.found_sides else rough_normals
+        return Drawn(shape, clean, noisy, normals_of(noisy[:, :3], clean[:, 3:]))
+
     def crop(self, clean: np.ndarray, noisy: np.ndarray, rough: np.ndarray, rng: np.random.Generator) -> dict[str, Any]:
         """Input and target (size, 6) around a random point, with the normals of a random side.
 
-        Those of the input are `rough` (n, 3), or true in some crops where they are mixed.
+        Those of the input are `rough` (n, 3), or true in some crops where they are mixed. Where their sides were found,
+        the side of the crop is that of most of its inner points.
         """
-        center = noisy[rng.integers(len(noisy)), :3]
+        places = noisy[:, :3]
+        if self.found_sides and rng.random() < HARD:
+            wrong = (rough * clean[:, 3:]).sum(1) < WRONG
+            places = places[wrong] if wrong.any() else places
+        center = places[rng.integers(len(places))]
         distance = np.linalg.norm(noisy[:, :3] - center, axis=1)
         near = np.argpartition(distance, self.size - 1)[: self.size]
         near = near[np.argsort(distance[near])]
         true = self.mixed and rng.random() < GIVEN
         normals = noisy[near, 3:] if true else rough[near]
         side = -1.0 if rng.random() < 0.3 else 1.0
+        if self.found_sides:
+            inner = near[: self.size // 2]
+            normals = normals * (1.0 if (rough[inner] * clean[inner, 3:]).sum() >= 0 else -1.0)
         crop = np.hstack([noisy[near, :3] - center, side * normals])
         target = np.hstack([clean[near, :3] - center, side * clean[near, 3:]])
         return {
@@ -151,6 +193,12 @@ def rough_normals(points: np.ndarray, true: np.ndarray) -> np.ndarray:
     return refit_normals(points, planes)
 
 
+def found_normals(points: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Normals as `settled_normals` finds them at work, outside and inside swapped where most are those of `true`."""
+    found = settled_normals(points, None).normals
+    return found if (found * true).sum() >= 0 else -found
+
+
 def uneven(cloud: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
     """n points of a cloud, dense around one to four of them."""
     centers = cloud[rng.integers(len(cloud), size=rng.integers(1, 5)), :3]
@@ -162,13 +210,14 @@ def uneven(cloud: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
 class WholeClouds(Dataset[dict[str, Any]]):
     """Validation: for each mesh an input cloud of n points and a target of 4 n blue noise points, always the same."""
 
-    def __init__(self, meshes: dict[str, Mesh], n: int, *, normals: str, seed: int) -> None:
+    def __init__(self, meshes: dict[str, Mesh], n: int, *, normals: str, sides: str = "true", seed: int) -> None:
         self.items = []
         for index, (name, mesh) in enumerate(meshes.items()):
             rng = np.random.default_rng((seed, index))
             cloud = sample_area(mesh, n, rng)
             if normals != "given":
-                cloud[:, 3:] = rough_normals(cloud[:, :3], cloud[:, 3:])
+                normals_of = found_normals if sides == "found" else rough_normals
+                cloud[:, 3:] = normals_of(cloud[:, :3], cloud[:, 3:])
             target = sample_poisson_disk(mesh, 4 * n, rng)
             arrays = {"input": cloud, "target": target}
             item = {key: torch.from_numpy(value).float() for key, value in arrays.items()}

@@ -14,9 +14,10 @@ import torch
 from pnu.commands.train import main as train
 from pnu.data import shapes
 from pnu.data.crop_module import ProjectionDataModule
-from pnu.data.crops import Crops, WholeClouds, flattened
+from pnu.data.crops import WRONG, Crops, WholeClouds, flattened
 from pnu.data.mesh_scene import MeshScene
 from pnu.data.patch_module import PatchDataModule
+from pnu.geometry.cloud_normals import settled_normals
 from pnu.geometry.mesh_sampling import closest_points, face_normals, sample_area
 from pnu.io import Mesh, read_json, write_mesh
 from pnu.losses.projection import SurfaceLoss
@@ -87,9 +88,40 @@ def test_some_crops_are_noisy_and_some_are_turned_inside_out(meshes: dict[str, M
     assert 0 < sum(bool((i["side"] < 0).any()) for i in items) < 40
 
 
+def test_clouds_of_a_pool_are_used_again_in_other_crops(meshes: dict[str, Mesh]) -> None:
+    crops = Crops(meshes, 8, size=64, views=1, pool=2, seed=3)
+    first, again, other = crops[0, 0], crops[0, 2], crops[0, 1]
+    assert torch.equal(first["index"], again["index"])
+    assert not torch.equal(first["center"], again["center"])
+    assert set(crops.drawn) == {0, 1}
+    cloud = crops.drawn[0].noisy[:, :3]
+    for item in (first, again):
+        assert (np.abs(cloud - item["center"].numpy()).sum(1) == 0).any()
+    assert not (np.abs(cloud - other["center"].numpy()).sum(1) == 0).any()
+    assert torch.equal(Crops(meshes, 8, size=64, views=1, pool=2, seed=3)[0, 2]["input"], again["input"])
+
+
+def test_sides_that_are_found_are_those_at_work_and_mostly_true(meshes: dict[str, Mesh]) -> None:
+    crops = Crops(meshes, 6, size=200, views=4, normals="estimated", sides="found", least=300, pool=3)
+    hard = []
+    for index in range(6):
+        item = crops[0, index]
+        agree = (item["input"][..., 3:] * item["target"][..., 3:]).sum(-1)
+        assert (agree[:, :100].sum(1) > 0).all()  # each crop has the side of most of its inner points
+        hard += agree[:, 0].tolist()
+    cloud = crops.drawn[0]
+    at_work = settled_normals(cloud.noisy[:, :3], None).normals
+    np.testing.assert_array_equal(cloud.rough, at_work * np.sign((cloud.rough * at_work).sum()))
+    assert np.mean(np.array(hard) < WRONG) > 0.2  # a third begins where they are wrong
+
+
 def test_unknown_kind_of_normals_is_refused(meshes: dict[str, Mesh]) -> None:
     with pytest.raises(ValueError, match=r"data\.normals=guessed: expected given, estimated or mixed"):
         Crops(meshes, 1, normals="guessed")
+    with pytest.raises(ValueError, match=r"data\.sides=found: expected true, or found with data\.normals=estimated"):
+        Crops(meshes, 1, sides="found")
+    with pytest.raises(ValueError, match=r"data\.pool=0: expected a number of clouds"):
+        Crops(meshes, 1, pool=0)
 
 
 def test_validation_clouds_do_not_change(meshes: dict[str, Mesh]) -> None:
