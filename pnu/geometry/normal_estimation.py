@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnu.geometry.noise_level import noise_level
-from pnu.geometry.orientation import ROWS, SOME_NOISE, NeighborCloud, field, lower_median, signs
+from pnu.geometry.orientation import ROWS, SOME_NOISE, NeighborCloud, field, lower_median, agreeing_normals, signs
 from pnu.geometry.point_tree import PointTree
 from pnu.runtime.threads import thread_count
 
 Array = NDArray[Any]  # float64 or float32
 Index = NDArray[np.int64]
 f32 = np.float32
+FIELDS = 3  # of a clean cloud in the second turn; each smooths a little, and closes thin walls a little
 
 
 def estimate_normals(points: Array, k: int = 16, *, orient: bool = True) -> Array:
@@ -82,15 +83,19 @@ def _plane_normals(points: Array, idx: Index, weight: Array | None = None) -> ND
 
 def _refined(cloud: NeighborCloud, lines: Array, *, oriented: bool = False) -> Array:
     """Oriented normals from lines (n, 3). Each turn of field and fit leaves cleaner lines for the next."""
-    normals, noise = lines.astype(f32), SOME_NOISE
-    for _ in range(2):
-        if not oriented:
-            normals = normals * signs(cloud, normals)[:, None]
-        for _ in range(5):
-            normals = field(cloud, normals, noise)
-        normals = _sheet_normals(cloud, normals, noise)
-        noise = noise_level(cloud.points, normals) / float(lower_median(cloud.spacing))
-    return normals
+    normals = lines.astype(f32)
+    if not oriented:
+        normals = agreeing_normals(cloud, normals)
+    normals = _sheet_normals(cloud, field(cloud, normals, SOME_NOISE), SOME_NOISE)
+    noise = _noise(cloud, normals)
+    for _ in range(FIELDS if noise < SOME_NOISE else 1):
+        normals = field(cloud, normals, noise)
+    return _sheet_normals(cloud, normals, noise)
+
+
+def _noise(cloud: NeighborCloud, normals: Array) -> float:
+    """In spacings."""
+    return noise_level(cloud.points, normals) / float(lower_median(cloud.spacing))
 
 
 def _sheet_normals(cloud: NeighborCloud, normals: NDArray[np.float32], noise: float) -> NDArray[np.float32]:

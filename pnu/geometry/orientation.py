@@ -2,11 +2,12 @@
 
 By the winding number. For outward normals n and point areas a the double layer
 w(x) = sum_j a_j n_j.(p_j - x) / (4 pi |p_j - x|^3) is 1 inside, 0 outside and 1/2 on the surface (Gauss). Asking for
-1/2 at every point, with unknown signed areas along given lines, is linear and does not depend on how the lines happen
-to point; a few steps of conjugate gradients give the smooth solution, whose signs are the orientation up to stray
-points. Those are settled by the gradient of w, which at each point must look along minus its normal: the field of all
-other dipoles. Related: parametric Gauss reconstruction (Lin et al. 2022), winding number normal consistency (Lin et al.
-2024), dipole propagation (Metzer et al. 2021); here the lines are known, which leaves one unknown a point.
+1/2 at every point, with an unknown dipole moment a n at each, is linear and asks nothing of how the points lie beside
+each other; a few steps of conjugate gradients give the smooth solution. Its moments are rough as directions, but look
+outward also where walls are thinner than the spacing and planes through neighbors see both of their sides. Stray lines
+are settled by the gradient of w, which at each point must look along minus its normal: the field of all other dipoles.
+Related: parametric Gauss reconstruction (Lin et al. 2022), winding number normal consistency (Lin et al. 2024), dipole
+propagation (Metzer et al. 2021).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 
 from pnu import kernels
 from pnu.geometry.farthest_sampling import farthest_points_large
+from pnu.geometry.noise_level import noise_level
 from pnu.geometry.point_tree import PointTree
 from pnu.runtime import threads
 
@@ -30,7 +32,9 @@ ANCHORS = 4096  # points whose dipoles all see each other: 64 MiB a matrix
 ROWS = 2**16  # points treated at once in local steps,
 CHUNK = 2**11  # or so many by a thread
 BLOCK = 128  # rows of a matrix of all pairs, few enough for a processor's cache
-OPEN = 0.6  # relative misfit of Gauss' law; closed shapes stay below 0.5, a hemisphere too
+OPEN = 0.6  # relative misfit of Gauss' law; closed shapes stay below 0.5, a hemisphere too,
+TORN = 0.64  # those with many walls thinner than the spacing below this
+STEPS = ((0.17, 4), (0.25, 3), (np.inf, 2))  # of conjugate gradients up to a noise in spacings, which more would fit
 SOME_NOISE = 0.1  # in spacings, where it is not known
 Array = NDArray[np.float32]
 Index = NDArray[np.int64]
@@ -67,13 +71,24 @@ def lower_median(values: Array) -> f32:
     return found
 
 
-def signs(cloud: NeighborCloud, lines: Array) -> Array:
-    """+1 or -1 for each line, (n,)."""
+def agreeing_normals(cloud: NeighborCloud, lines: Array) -> Array:
+    """Rough normals (n, 3) whose sides agree: lines (n, 3) with signs, on a closed shape drawn to the moments there."""
     if len(lines) <= ANCHORS:
-        sign = _global_signs(cloud, lines)
+        sign, moments = _global_signs(cloud, lines)
     else:
         anchors = farthest_points_large(cloud.points, ANCHORS)
-        sign = _spread(cloud, lines, anchors, _global_signs(NeighborCloud.of(cloud.points[anchors]), lines[anchors]))
+        some, of_anchors = _global_signs(NeighborCloud.of(cloud.points[anchors]), lines[anchors])
+        sign = _spread(cloud, lines, anchors, some)
+        moments = of_anchors[PointTree(cloud.points[anchors]).nearest(cloud.points, 1)[1][:, 0]]
+    normals = lines * sign[:, None]
+    normals = normals + np.where((normals * moments).sum(1, keepdims=True) > 0, moments, f32(0))
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), f32(1e-12))
+    return normals
+
+
+def signs(cloud: NeighborCloud, lines: Array) -> Array:
+    """+1 or -1 for each line, (n,)."""
+    sign = _sign((agreeing_normals(cloud, lines) * lines).sum(1))
     for _ in range(3):
         turned = field(cloud, lines * sign[:, None], SOME_NOISE)
         sign = _sign((turned * lines).sum(1))
@@ -90,27 +105,65 @@ def is_closed(cloud: NeighborCloud, normals: Array) -> bool:
     return bool(np.linalg.norm((np.abs(winding) - 0.5) * weight) <= OPEN * np.linalg.norm(0.5 * weight))
 
 
-def _global_signs(cloud: NeighborCloud, lines: Array) -> Array:
+def _global_signs(cloud: NeighborCloud, lines: Array) -> tuple[Array, Array]:
+    """A sign for each line, (n,), and the directions of the moments behind them, (n, 3), zero on open sheets."""
     weight = np.sqrt(cloud.area)
     half = f32(0.5) * weight
-    layer = _layers(cloud, lines, weight)
-    areas = _least_squares(layer, half, 4)
+    pairs = _Pairs(cloud, weight)
+    found = _least_squares(pairs, half, STEPS[0][1])
+    # with sides, since walls that are thin beside the spacing look like noise without
+    facing = lines * _sign((found[-1] * lines).sum(1))[:, None]
+    noise = noise_level(cloud.points, facing) / float(lower_median(cloud.spacing))
+    moments = found[next(steps for most, steps in STEPS if not noise > most) - 1]
+    along = (moments * lines).sum(1)
+    sign = _sign(along)
 
-    def misfit(sign: Array) -> float:
-        return float(np.linalg.norm(layer @ (sign * weight) - half) / np.linalg.norm(half))
+    def winding(sign: Array) -> Array:
+        return pairs.winding(lines * (sign * weight)[:, None])
 
-    # narrow dipoles keep thin walls apart, wide ones see past noise: Gauss' law tells which did better
-    sign = min((_settled(_dipoles(cloud, lines, width), _sign(areas))[0] for width in (1.0, 1.4, 2.0)), key=misfit)
-    if misfit(sign) > OPEN:
-        sign = _open_signs(cloud, lines, areas)
-        sign = sign * _sign((layer @ (sign * weight) * weight).sum())
-    return sign
+    if np.linalg.norm(winding(sign) - half) <= TORN * np.linalg.norm(half):
+        return sign, moments / np.maximum(np.linalg.norm(moments, axis=1, keepdims=True), f32(1e-12))
+    sign = _open_signs(cloud, lines, along)
+    return sign * _sign((winding(sign) * weight).sum()), np.zeros_like(lines)
 
 
-def _open_signs(cloud: NeighborCloud, lines: Array, areas: Array) -> Array:
+class _Pairs:
+    """Gauss' law between all pairs of points, each row and column times the factor (n,) of its point."""
+
+    def __init__(self, cloud: NeighborCloud, scale: Array) -> None:
+        self.points = cloud.points
+        self.inverse_cubed = np.empty((len(scale), len(scale)), f32)
+
+        def fill(rows: slice) -> None:
+            block = _inverse_distances(cloud, rows, 1.0) ** 3
+            self.inverse_cubed[rows] = block * (scale / f32(4 * np.pi)) * scale[rows, None]
+
+        threads.map_on_threads(fill, _blocks(scale))
+
+    def winding(self, moments: Array) -> Array:
+        """Winding number at each point, (n,), of moments (n, 3)."""
+        along = (self.points * moments).sum(1)
+        sums = self._sums(np.column_stack([along, moments]))
+        found: Array = sums[:, 0] - (self.points * sums[:, 1:]).sum(1)
+        return found
+
+    def transposed(self, values: Array) -> Array:
+        """The adjoint of `winding`: values (n,) -> (n, 3)."""
+        sums = self._sums(np.column_stack([values, self.points * values[:, None]]))
+        found: Array = self.points * sums[:, :1] - sums[:, 1:]
+        return found
+
+    def _sums(self, columns: Array) -> Array:
+        """The matrix times columns (n, c), block by block, the same for any number of threads."""
+        blocks = threads.map_on_threads(lambda rows: self.inverse_cubed[rows] @ columns, _blocks(columns))
+        return np.concatenate(blocks)
+
+
+def _open_signs(cloud: NeighborCloud, lines: Array, along: Array) -> Array:
     """Of an open sheet, where Gauss' law says little: the signs of least energy from several guesses.
 
-    Guesses: the areas' signs, lines followed from point to point, and the sides seen from 13 directions.
+    Guesses: the signs of the moments along the lines, lines followed from point to point, and the sides seen from 13
+    directions.
     """
     from scipy.sparse.csgraph import connected_components
 
@@ -118,8 +171,8 @@ def _open_signs(cloud: NeighborCloud, lines: Array, areas: Array) -> Array:
     axes = np.linalg.eigh(cloud.points.T @ cloud.points)[1]
     steps = np.array([*product((-1, 0, 1), repeat=3)][14:], f32)
     piece = connected_components(_graph(cloud, lines))[1]
-    surest = np.array([(np.abs(areas) * (piece == i)).argmax() for i in range(piece.max() + 1)])
-    guesses = [_sign(areas), _spread(cloud, lines, surest, _sign(areas[surest]))]
+    surest = np.array([(np.abs(along) * (piece == i)).argmax() for i in range(piece.max() + 1)])
+    guesses = [_sign(along), _spread(cloud, lines, surest, _sign(along[surest]))]
     guesses += [_sign(lines @ axes @ step) for step in steps]
     return min((_settled(dipoles, guess) for guess in guesses), key=lambda found: found[1])[0]
 
@@ -199,19 +252,20 @@ def _inverse_distances(cloud: NeighborCloud, rows: slice, width: float) -> Array
     return inverse
 
 
-def _least_squares(matrix: Array, target: Array, steps: int) -> Array:
-    """Conjugate gradients on the normal equations, stopped early: the smooth part of the solution."""
-    x, residual = np.zeros_like(target), target
-    gradient = matrix.T @ residual
-    direction, size = gradient, gradient @ gradient
+def _least_squares(pairs: _Pairs, target: Array, steps: int) -> list[Array]:
+    """Moments (n, 3) after each step of conjugate gradients on the normal equations; early ones are smoother."""
+    x, residual = np.zeros((len(target), 3), f32), target
+    gradient = pairs.transposed(residual)
+    direction, size, found = gradient, (gradient * gradient).sum(), []
     for _ in range(steps):
-        change = matrix @ direction
-        step = size / max(change @ change, f32(1e-30))
+        change = pairs.winding(direction)
+        step = size / max((change * change).sum(), f32(1e-30))
         x, residual = x + step * direction, residual - step * change
-        gradient = matrix.T @ residual
-        size, before = gradient @ gradient, size
+        found.append(x)
+        gradient = pairs.transposed(residual)
+        size, before = (gradient * gradient).sum(), size
         direction = gradient + size / max(before, f32(1e-30)) * direction
-    return x
+    return found
 
 
 def _graph(cloud: NeighborCloud, lines: Array) -> csr_matrix:
