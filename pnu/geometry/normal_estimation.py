@@ -8,14 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnu.geometry.noise_level import noise_level
-from pnu.geometry.orientation import ROWS, SOME_NOISE, NeighborCloud, field, lower_median, agreeing_normals, signs
+from pnu.geometry.orientation import ROWS, SOME_NOISE, NeighborCloud, agreeing_normals, field, lower_median, signs
 from pnu.geometry.point_tree import PointTree
 from pnu.runtime.threads import thread_count
 
 Array = NDArray[Any]  # float64 or float32
 Index = NDArray[np.int64]
 f32 = np.float32
-FIELDS = 3  # of a clean cloud in the second turn; each smooths a little, and closes thin walls a little
+FIELDS, NOISY_FIELDS = (1, 3), (3, 5)  # before each fit; they smooth, but see across walls thinner than the spacing
+MUCH = 0.25  # spacings of noise from which on there are more of them
 
 
 def estimate_normals(points: Array, k: int = 16, *, orient: bool = True) -> Array:
@@ -82,15 +83,17 @@ def _plane_normals(points: Array, idx: Index, weight: Array | None = None) -> ND
 
 
 def _refined(cloud: NeighborCloud, lines: Array, *, oriented: bool = False) -> Array:
-    """Oriented normals from lines (n, 3). Each turn of field and fit leaves cleaner lines for the next."""
+    """Oriented normals from lines (n, 3). Each turn of fields and fit leaves cleaner lines for the next."""
     normals = lines.astype(f32)
     if not oriented:
         normals = agreeing_normals(cloud, normals)
-    normals = _sheet_normals(cloud, field(cloud, normals, SOME_NOISE), SOME_NOISE)
-    noise = _noise(cloud, normals)
-    for _ in range(FIELDS if noise < SOME_NOISE else 1):
-        normals = field(cloud, normals, noise)
-    return _sheet_normals(cloud, normals, noise)
+    for turn in range(2):
+        noise = _noise(cloud, normals)
+        used = noise if turn else SOME_NOISE
+        for _ in range((FIELDS if noise < MUCH else NOISY_FIELDS)[turn]):
+            normals = field(cloud, normals, used)
+        normals = _sheet_normals(cloud, normals, used)
+    return normals
 
 
 def _noise(cloud: NeighborCloud, normals: Array) -> float:
