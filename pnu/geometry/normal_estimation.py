@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnu.geometry.noise_level import noise_level
-from pnu.geometry.orientation import ROWS, SOME_NOISE, NeighborCloud, agreeing_normals, field, lower_median, signs
+from pnu.geometry.orientation import ROWS, SOME_NOISE, NeighborCloud, agreeing_normals, field, signs
 from pnu.geometry.point_tree import PointTree
 from pnu.runtime.threads import thread_count
 
@@ -87,18 +86,13 @@ def _refined(cloud: NeighborCloud, lines: Array, *, oriented: bool = False) -> A
     normals = lines.astype(f32)
     if not oriented:
         normals = agreeing_normals(cloud, normals)
-    for turn in range(2):
-        noise = _noise(cloud, normals)
-        used = noise if turn else SOME_NOISE
-        for _ in range((FIELDS if noise < MUCH else NOISY_FIELDS)[turn]):
-            normals = field(cloud, normals, used)
-        normals = _sheet_normals(cloud, normals, used)
+    for turn, (few, more) in enumerate(zip(FIELDS, NOISY_FIELDS, strict=True)):
+        noise = cloud.noise(normals)
+        seen = noise if turn else SOME_NOISE  # rough normals show more of it than there is
+        for _ in range(more if noise >= MUCH else few):
+            normals = field(cloud, normals, seen)
+        normals = _sheet_normals(cloud, normals, seen)
     return normals
-
-
-def _noise(cloud: NeighborCloud, normals: Array) -> float:
-    """In spacings."""
-    return noise_level(cloud.points, normals) / float(lower_median(cloud.spacing))
 
 
 def _sheet_normals(cloud: NeighborCloud, normals: NDArray[np.float32], noise: float) -> NDArray[np.float32]:

@@ -64,6 +64,10 @@ class NeighborCloud(NamedTuple):
         floor = max(f32(0.1) * lower_median(spacing), f32(1e-6))  # duplicates
         return NeighborCloud(single, idx, np.maximum(spacing, floor), np.maximum(area, floor * floor))
 
+    def noise(self, normals: Array) -> float:
+        """Across the surface, in spacings, where normals (n, 3) tell the sides of thin walls apart."""
+        return noise_level(self.points, normals) / float(lower_median(self.spacing))
+
 
 def lower_median(values: Array) -> f32:
     """The middle one of values (n,), of two the lower."""
@@ -79,7 +83,8 @@ def agreeing_normals(cloud: NeighborCloud, lines: Array) -> Array:
         anchors = farthest_points_large(cloud.points, ANCHORS)
         some, of_anchors = _global_signs(NeighborCloud.of(cloud.points[anchors]), lines[anchors])
         sign = _spread(cloud, lines, anchors, some)
-        moments = of_anchors[PointTree(cloud.points[anchors]).nearest(cloud.points, 1)[1][:, 0]]
+        near = PointTree(cloud.points[anchors]).nearest(cloud.points, 1, threads=threads.thread_count())[1]
+        moments = of_anchors[near[:, 0]]
     normals = lines * sign[:, None]
     normals = normals + np.where((normals * moments).sum(1, keepdims=True) > 0, moments, f32(0))
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), f32(1e-12))
@@ -101,8 +106,8 @@ def is_closed(cloud: NeighborCloud, normals: Array) -> bool:
         chosen = farthest_points_large(cloud.points, ANCHORS)
         cloud, normals = NeighborCloud.of(cloud.points[chosen]), normals[chosen]
     weight = np.sqrt(cloud.area)
-    winding = _layers(cloud, normals, np.ones_like(weight)) @ cloud.area
-    return bool(np.linalg.norm((np.abs(winding) - 0.5) * weight) <= OPEN * np.linalg.norm(0.5 * weight))
+    winding = _Pairs(cloud, weight).winding(normals * weight[:, None])
+    return bool(np.linalg.norm(np.abs(winding) - 0.5 * weight) <= OPEN * np.linalg.norm(0.5 * weight))
 
 
 def _global_signs(cloud: NeighborCloud, lines: Array) -> tuple[Array, Array]:
@@ -113,7 +118,7 @@ def _global_signs(cloud: NeighborCloud, lines: Array) -> tuple[Array, Array]:
     found = _least_squares(pairs, half, STEPS[0][1])
     # with sides, since walls that are thin beside the spacing look like noise without
     facing = lines * _sign((found[-1] * lines).sum(1))[:, None]
-    noise = noise_level(cloud.points, facing) / float(lower_median(cloud.spacing))
+    noise = cloud.noise(facing)
     moments = found[next(steps for most, steps in STEPS if not noise > most) - 1]
     along = (moments * lines).sum(1)
     sign = _sign(along)
@@ -132,13 +137,14 @@ class _Pairs:
 
     def __init__(self, cloud: NeighborCloud, scale: Array) -> None:
         self.points = cloud.points
-        self.inverse_cubed = np.empty((len(scale), len(scale)), f32)
+        if kernels.ready():
+            from pnu.kernels.dipoles import inverse_cube_rows
 
-        def fill(rows: slice) -> None:
-            block = _inverse_distances(cloud, rows, 1.0) ** 3
-            self.inverse_cubed[rows] = block * (scale / f32(4 * np.pi)) * scale[rows, None]
-
-        threads.map_on_threads(fill, _blocks(scale))
+            self.inverse_cubes = _all_pairs(inverse_cube_rows, cloud, cloud.points, cloud.spacing, scale)
+            return
+        self.inverse_cubes = np.concatenate([_inverse_distances(cloud, rows, 1.0) ** 3 for rows in _blocks(scale)])
+        self.inverse_cubes *= scale / f32(4 * np.pi)
+        self.inverse_cubes *= scale[:, None]
 
     def winding(self, moments: Array) -> Array:
         """Winding number at each point, (n,), of moments (n, 3)."""
@@ -155,7 +161,7 @@ class _Pairs:
 
     def _sums(self, columns: Array) -> Array:
         """The matrix times columns (n, c), block by block, the same for any number of threads."""
-        blocks = threads.map_on_threads(lambda rows: self.inverse_cubed[rows] @ columns, _blocks(columns))
+        blocks = threads.map_on_threads(lambda rows: self.inverse_cubes[rows] @ columns, _blocks(columns))
         return np.concatenate(blocks)
 
 
@@ -196,18 +202,6 @@ def _blocks(lines: Array) -> list[slice]:
     return [slice(start, start + BLOCK) for start in range(0, len(lines), BLOCK)]
 
 
-def _layers(cloud: NeighborCloud, lines: Array, scale: Array) -> Array:
-    """Winding number at each point of unit area at each point, times the factors (n,) of both: (n, n)."""
-    if kernels.ready():
-        from pnu.kernels.dipoles import winding_rows
-
-        return _all_pairs(winding_rows, cloud, lines, cloud.spacing, scale)
-    matrix = np.concatenate([_layer(cloud, lines, rows) for rows in _blocks(lines)])
-    matrix *= scale
-    matrix *= scale[:, None]
-    return matrix
-
-
 def _all_pairs(
     rows_of: Callable[[Array, int, Array], None], cloud: NeighborCloud, lines: Array, widths: Array, scale: Array
 ) -> Array:
@@ -217,14 +211,6 @@ def _all_pairs(
     sources, matrix = as_sources(cloud.points, lines, widths, scale), np.empty((len(lines), len(lines)), f32)
     threads.map_on_threads(lambda i: rows_of(sources, i, matrix[i : i + BLOCK]), range(0, len(lines), BLOCK))
     return matrix
-
-
-def _layer(cloud: NeighborCloud, lines: Array, rows: slice) -> Array:
-    """Winding number at points `rows` of unit area at each point, (r, n)."""
-    points = cloud.points
-    along = (points * lines).sum(1) - points[rows] @ lines.T
-    winding: Array = _inverse_distances(cloud, rows, 1.0) ** 3 * along / f32(4 * np.pi)
-    return winding
 
 
 def _dipoles(cloud: NeighborCloud, lines: Array, width: float) -> Array:

@@ -1,4 +1,4 @@
-"""Winding numbers and fields of dipoles at points, each from all others or from its neighbors: what
+"""Distances and fields of dipoles at points, each from all others or from its neighbors: what
 `pnu.geometry.orientation` asks of matrices of all pairs, from differences of places and without matrices between."""
 
 import numpy as np
@@ -20,16 +20,15 @@ def as_sources(points: Singles, lines: Singles, widths: Singles, scale: Singles)
 
 
 @kernel("void(float32[:, ::1], int64, float32[:, ::1])")
-def winding_rows(sources: Singles, first: int, out: Singles) -> None:
-    """out[i, j]: winding number of a unit area at source j, seen from source first + i, times both factors."""
+def inverse_cube_rows(sources: Singles, first: int, out: Singles) -> None:
+    """out[i, j]: 1 / (4 pi r^3), r the distance of source j from source first + i, times both factors; no lines."""
     for i in range(len(out)):
         x, y, z = sources[X, first + i], sources[Y, first + i], sources[Z, first + i]
         width_sq, scale = sources[WIDTH_SQ, first + i], sources[SCALE, first + i] * PER_TURN
         for j in range(sources.shape[1]):
             dx, dy, dz = sources[X, j] - x, sources[Y, j] - y, sources[Z, j] - z
             inverse_sq = f32(1) / max(dx * dx + dy * dy + dz * dz, sources[WIDTH_SQ, j] + width_sq)
-            along = dx * sources[LINE_X, j] + dy * sources[LINE_Y, j] + dz * sources[LINE_Z, j]
-            out[i, j] = along * inverse_sq * np.sqrt(inverse_sq) * (sources[SCALE, j] * scale)
+            out[i, j] = inverse_sq * np.sqrt(inverse_sq) * (sources[SCALE, j] * scale)
 
 
 @kernel("void(float32[:, ::1], int64, float32[:, ::1])")

@@ -16,7 +16,7 @@ from pnu.kernels.code_loading import DIGEST, Kernel, MachineCode, kernel_argumen
 
 PUSH = "void(float64[:, ::1], float64[:, ::1], int64[:, ::1], float64[:, ::1], float64[::1], int64, float64[:, ::1])"
 QUANTILES = "void(float64[::1], int64[:, ::1], int64, float64[::1], int64, float64[:, :])"
-WINDING = "void(float32[:, ::1], int64, float32[:, ::1])"
+ROWS_OF = "void(float32[:, ::1], int64, float32[:, ::1])"
 
 
 def kept() -> Path:
@@ -73,7 +73,7 @@ def results():
     yield farthest_sampling.farthest_order(points.astype(np.float32), 200, 3)
     yield even_spacing.repel(points, normals, steps=2)
     yield outlier_features.outlier_features(points)
-    yield orientation._layers(near, lines, np.sqrt(near.area))
+    yield orientation._Pairs(near, np.sqrt(near.area)).inverse_cubes
     yield orientation._dipoles(near, lines, 1.4)
     yield orientation.field(near, lines, 0.1)
 def called(kernel, name):
@@ -231,7 +231,7 @@ def test_signatures_are_read() -> None:
 
 
 def test_other_threads_go_on_while_a_kernel_runs(code: MachineCode) -> None:
-    kernel = code.kernel("dipoles.winding_rows", WINDING, quantiles)
+    kernel = code.kernel("dipoles.inverse_cube_rows", ROWS_OF, quantiles)
     sources, out = (
         np.random.default_rng(0).normal(size=(8, 8000)).astype(np.float32),
         np.empty((4000, 8000), np.float32),

@@ -41,12 +41,12 @@ KINDS = pytest.mark.parametrize("kind", ["ellipsoid", "sheet", "repeated", "far"
 
 @KINDS
 @pytest.mark.parametrize("n", [7, 130, 300])
-@pytest.mark.parametrize("what", ["winding numbers", "dipoles", "field"])
+@pytest.mark.parametrize("what", ["distances", "dipoles", "field"])
 def test_fields_equal_plain_ones(monkeypatch: pytest.MonkeyPatch, what: str, n: int, kind: str) -> None:
     points, normals = shape(kind, n)
     cloud, lines = NeighborCloud.of(points), normals.astype(np.float32)
     ways: dict[str, Callable[[], np.ndarray]] = {
-        "winding numbers": lambda: orientation._layers(cloud, lines, np.sqrt(cloud.area)),
+        "distances": lambda: orientation._Pairs(cloud, np.sqrt(cloud.area)).inverse_cubes,
         "dipoles": lambda: orientation._dipoles(cloud, lines, 1.4),
         "field": lambda: orientation.field(cloud, lines, 0.1),
     }
