@@ -20,6 +20,7 @@ PARTS = {
     "test_sweep.py": "sweeps, launchers, searches, Ctrl-C",
 }
 OTHERS = "all others"
+LONGEST = 3600  # seconds of a test; one that takes longer hangs
 
 
 class Summary:
@@ -49,7 +50,7 @@ class Summary:
 
 def main(arguments: list[str]) -> int:
     summary, started = Summary(), time.monotonic()
-    code = int(pytest.main(["-m", "slow", *arguments], plugins=[summary]))
+    code = int(pytest.main(["-m", "slow", "-o", f"faulthandler_timeout={LONGEST}", *arguments], plugins=[summary]))
     if code == pytest.ExitCode.INTERRUPTED:
         summary.failed.append("interrupted, the rest did not run")
     total = f"{(time.monotonic() - started) / 60:.0f} minutes in all"
