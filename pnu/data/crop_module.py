@@ -19,7 +19,7 @@ class ProjectionDataModule(EpochDataModule):
         procedural: train on the procedural shapes
         validation: names of the meshes kept for validation and test
         normals: of the input: given, estimated from its points, or mixed
-        sides: of estimated normals: true, or found as at work
+        sides: of estimated normals: from the truth, or found as at work
         scans: share of the clouds that are simulated scans
         blue: share of the other clouds whose points keep a distance, as blue noise
         least: points of the smallest clouds
@@ -40,7 +40,7 @@ class ProjectionDataModule(EpochDataModule):
 
     def __init__(
         self, root: str | None = None, procedural: bool = True, validation: Iterable[str] = (),
-        normals: Literal["given", "estimated", "mixed"] = "given", sides: Literal["true", "found"] = "true",
+        normals: Literal["given", "estimated", "mixed"] = "given", sides: Literal["truth", "found"] = "truth",
         scans: float = 0.0, blue: float = 0.15, least: int = LEAST,
         noise: float = 0.02, noisy: float = 0.5, clouds: int = 6400, pool: int | None = None, size: int = 384,
         views: int = 2, batch_size: int = 8, points: int = 2048, workers: int = 0, seed: int = 0,

@@ -56,13 +56,13 @@ class Crops(Dataset[dict[str, Any]]):
 
     def __init__(
         self, meshes: dict[str, Mesh], length: int, *, size: int = 384, views: int = 2, normals: str = "given",
-        sides: str = "true", scans: float = 0.0, blue: float = 0.15, least: int = LEAST, noise: float = 0.02,
+        sides: str = "truth", scans: float = 0.0, blue: float = 0.15, least: int = LEAST, noise: float = 0.02,
         noisy: float = 0.5, pool: int | None = None, seed: int = 0,
     ) -> None:  # fmt: skip
         if normals not in ("given", "estimated", "mixed"):
             raise ValueError(f"data.normals={normals}: expected given, estimated or mixed")
-        if sides not in ("true", "found") or (sides == "found" and normals != "estimated"):
-            raise ValueError(f"data.sides={sides}: expected true, or found with data.normals=estimated")
+        if sides not in ("truth", "found") or (sides == "found" and normals != "estimated"):
+            raise ValueError(f"data.sides={sides}: expected truth, or found with data.normals=estimated")
         if pool is not None and pool < 1:
             raise ValueError(f"data.pool={pool}: expected a number of clouds, or null")
         if not 0 <= scans <= 1:
@@ -210,7 +210,7 @@ def uneven(cloud: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
 class WholeClouds(Dataset[dict[str, Any]]):
     """Validation: for each mesh an input cloud of n points and a target of 4 n blue noise points, always the same."""
 
-    def __init__(self, meshes: dict[str, Mesh], n: int, *, normals: str, sides: str = "true", seed: int) -> None:
+    def __init__(self, meshes: dict[str, Mesh], n: int, *, normals: str, sides: str = "truth", seed: int) -> None:
         self.items = []
         for index, (name, mesh) in enumerate(meshes.items()):
             rng = np.random.default_rng((seed, index))

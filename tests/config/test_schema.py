@@ -6,7 +6,7 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin
 
 import pytest
 import yaml
@@ -162,6 +162,20 @@ def test_every_argument_has_words_and_a_type(group: str, target: str) -> None:
     for name, argument in settable(group, class_arguments(group, target)):
         assert argument.words, f"{target}: {name} is not in the docstring's Args:"
         assert argument.hint is not Any, f"{target}: {name} has no type that a config can hold"
+
+
+def test_words_to_choose_from_are_words_on_a_command_line() -> None:
+    """`true`, `null` or `1` would come as something else."""
+    chosen = {
+        (target, name, word)
+        for group, target in CLASSES
+        for name, argument in settable(group, class_arguments(group, target))
+        for kind in (argument.hint, *get_args(argument.hint))
+        if get_origin(kind) is Literal
+        for word in get_args(kind)
+    }
+    assert len(chosen) > 10
+    assert not [one for one in chosen if isinstance(one[2], str) and yaml.safe_load(one[2]) != one[2]]
 
 
 def test_comments_of_conf_are_the_words_on_libraries() -> None:

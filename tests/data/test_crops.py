@@ -118,7 +118,7 @@ def test_sides_that_are_found_are_those_at_work_and_mostly_true(meshes: dict[str
 def test_unknown_kind_of_normals_is_refused(meshes: dict[str, Mesh]) -> None:
     with pytest.raises(ValueError, match=r"data\.normals=guessed: expected given, estimated or mixed"):
         Crops(meshes, 1, normals="guessed")
-    with pytest.raises(ValueError, match=r"data\.sides=found: expected true, or found with data\.normals=estimated"):
+    with pytest.raises(ValueError, match=r"data\.sides=found: expected truth, or found with data\.normals=estimated"):
         Crops(meshes, 1, sides="found")
     with pytest.raises(ValueError, match=r"data\.pool=0: expected a number of clouds"):
         Crops(meshes, 1, pool=0)
