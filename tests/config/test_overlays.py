@@ -27,7 +27,8 @@ UPSAMPLING = [overlay for overlay in EXPERIMENTS if overlay != "experiment=norma
 
 @pytest.mark.parametrize("overlay", OVERLAYS)
 def test_every_overlay_composes(overlay: str) -> None:
-    base = ["experiment=surface"] if overlay.startswith("setting=surface/") else []  # whose parts they leave out
+    group = overlay.removeprefix("setting=").partition("/")[0]
+    base = [f"ablation={group}"] if group.startswith("surface") else []  # whose parts they leave out
     cfg = compose_config(Train, [*base, overlay])
     if not overlay.endswith(("=default", "=full")):  # it changes something
         assert OmegaConf.to_container(cfg) != plain_config(*base)
