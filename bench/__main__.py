@@ -1,4 +1,4 @@
-"""All measurements of speed in one table: `python -m bench [ops] [loss] [step] [inference] [scale] [--threads 2] ...`.
+"""All measurements of speed in one table: `python -m bench [ops] [loss] [step] [precision] [inference] [scale] [--threads 2] ...`.
 
 The table, and the machine it was made on, go to outputs/bench/ as Markdown and JSON. Every figure is a ratio of medians
 of runs taken in turn (`bench.timing`). Where ours takes more than 10 % longer beside an alternative than the committed
@@ -27,6 +27,7 @@ PARTS: dict[str, Callable[[], Iterable[Row]]] = {
     "ops": ops.rows,
     "loss": step.loss_rows,
     "step": step.step_rows,
+    "precision": step.precision_rows,
     "compiled": compiled.rows,
     "inference": inference.rows,
 }

@@ -90,10 +90,11 @@ def trainings() -> tuple[Callable[[], Tensor], Callable[[], Tensor]]:
     ours = PNU()
     ours.load_state_dict(from_released(plain.state_dict()))
 
-    def of(network: nn.Module, loss: nn.Module) -> Callable[[], Tensor]:
-        return partial(step, network, loss, torch.optim.Adam(network.parameters(), 1e-3, weight_decay=1e-5))
+    return _training(accelerate(ours), accelerate(CompoundLoss())), _training(plain, PlainLoss())
 
-    return of(accelerate(ours), accelerate(CompoundLoss())), of(plain, PlainLoss())
+
+def _training(network: nn.Module, loss: nn.Module) -> Callable[[], Tensor]:
+    return partial(step, network, loss, torch.optim.Adam(network.parameters(), 1e-3, weight_decay=1e-5))
 
 
 def loss_of(loss: nn.Module, prediction: Tensor) -> None:
@@ -111,6 +112,42 @@ def step_rows(rounds: int = 3) -> list[Row]:
                 "data of a step: loaded, downsampled, augmented", {"pnu": loading(Path(folder)), "training step": ours}
             ),
         ]
+
+
+def precision_rows(rounds: int = 3) -> list[Row]:
+    """The step in float32 against the same in bfloat16, which a processor with AMX multiplies several times as fast."""
+    ours = _training(accelerate(PNU()), accelerate(CompoundLoss()))
+    plain = _training(PNU(), CompoundLoss())
+    left, right = torch.randn(CLOUDS * POINTS, 512), torch.randn(512, 512)
+    product = partial(torch.mm, left, right)
+    return [
+        compare(
+            f"training step, {SIZE}, float32",
+            {
+                "pnu": ours,
+                "trainer.precision=bf16-mixed": partial(_mixed, ours),
+                "bf16-mixed, plain modules": partial(_mixed, plain),
+                "products in bfloat16": partial(_coarse, ours),
+            },
+            rounds=rounds,
+        ),
+        compare("a large product, bfloat16", {"bfloat16": partial(_coarse, product), "float32": product}),
+    ]
+
+
+def _mixed(run: Callable[[], Tensor]) -> Tensor:
+    with torch.autocast("cpu", torch.bfloat16):
+        return run()
+
+
+def _coarse(run: Callable[[], Tensor]) -> Tensor:
+    """With products of float32 that torch may round to bfloat16."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("medium")
+    try:
+        return run()
+    finally:
+        torch.set_float32_matmul_precision(before)
 
 
 def loading(folder: Path) -> Callable[[], object]:
