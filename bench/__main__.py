@@ -1,4 +1,4 @@
-"""All measurements of speed in one table: `python -m bench [PART ...] [--threads 2] ...`, or of parts such as step.
+"""All measurements of speed in one table, or those of some parts: `python -m bench [step] [--threads 2] ...`.
 
 The table, and the machine it was made on, go to outputs/bench/ as Markdown and JSON. Every figure is a ratio of medians
 of runs taken in turn (`bench.timing`). Where ours takes more than 10 % longer beside an alternative than the committed
