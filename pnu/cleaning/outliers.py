@@ -15,7 +15,8 @@ WEIGHTS = Path(__file__).with_name("outliers.safetensors")
 SURE = 3.0  # logarithm of the odds from which on a point is taken for stray,
 LIKELY = 1.2  # or this where there are many: a share of
 MANY = 0.0035  # of the points is sure; noise of 1 % of the radius stays below
-ROUNDS = 3  # a stray point hides another
+ROUNDS = 3  # a stray point hides another,
+SINGLE = 3  # but so few of them none
 PIECE = 12  # points below which a piece that stands apart is stray
 APART = 6.0  # usual spacings between a piece and all others
 EVEN = 0.45  # breadth of the middle 80 % of nearest distances over their median, below which points keep a distance
@@ -58,9 +59,11 @@ def stray_points(points: NDArray[np.float64]) -> NDArray[np.bool_]:
         odds = stray_odds(outlier_features(points[rows]))
         if (odds > SURE).mean() > MANY:
             enough = LIKELY
-        stray = (odds > enough) & ~fit_in_order(points[rows])
+        stray = odds > enough
+        if stray.any():
+            stray &= ~fit_in_order(points[rows])
         stays[rows[stray]] = False
-        if not stray.any():
+        if stray.sum() <= SINGLE:
             break
     if stays.sum() >= FEWEST and not stays.all():
         stays[~stays] = continue_surface(points[~stays], points[stays])

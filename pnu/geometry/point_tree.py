@@ -9,6 +9,7 @@ from pnu import kernels
 
 CHUNK = 2048  # queries that a thread takes at once
 FEW = 256  # queries whose order does not matter
+RUN = 16  # queries beside each other, of more of them, whose order does not
 
 
 class PointTree:
@@ -70,7 +71,7 @@ class PointTree:
             return np.asarray(self.tree.order)
         from pnu.kernels.boxes import box_order
 
-        return np.asarray(box_order(np.require(queries, np.float64, ["C", "W", "A"]), FEW))
+        return np.asarray(box_order(np.require(queries, np.float64, ["C", "W", "A"]), RUN))
 
 
 def finite(points: NDArray[np.floating], name: str) -> NDArray[np.float64]:

@@ -1,7 +1,8 @@
 """The k nearest points of a cloud, exact in float64, on a tree of boxes with eight children each.
 
-A search collects all points within a radius, in which the last query found its k along the curve that queries come in,
-or else the nearest box. What it gives depends on neither: neighbors come by distance, equal ones by their index.
+Queries that lie together, as they come along a curve, share what lies around all of them, in a radius by what the last
+one needed; where that was too small, each collects all points within a radius of its own. What a search gives depends
+on neither: neighbors come by distance, equal ones by their index.
 """
 
 import numpy as np
@@ -13,8 +14,15 @@ from pnu.kernels.compilation import kernel
 LEAF = 16  # points
 CHILDREN = 8
 NOWHERE = 1e150  # places of points and boxes that are not there; its square is finite
+FAR = 1e305  # farther than any point, squared
 MORE = 3.0  # / sqrt(k): by that share more than the squared radius in which the query before found its neighbors
 ROOM = 8  # times k, at most, are collected before those too far are dropped
+TOGETHER = 8  # queries that share what lies around them,
+SPREAD = 20.0  # if none is farther from their middle, squared, than so many squared radii of the last one,
+CROWD = 1024  # and if there are no more points
+ROUNDS = 40  # of narrowing down which points are the k nearest
+TINY = 1e-280  # squared radii below which rounding is no longer small
+ROUNDING = 1e-9  # of distances, far more than there is
 
 
 class NeighborTree:
@@ -110,6 +118,67 @@ def _farthest(dist: Floats, k: int) -> float:
 
 
 @kernel(exact=True, inner=True)
+def _sift(dist: Floats, ids: Ints, count: int, k: int, guess: float) -> int:
+    """Bring the k nearest of `count` points to the front, in any order, and with them some that are as far as the last.
+
+    By regula falsi over the radius: the number of points in it grows about as its square, where they lie on a surface.
+    Returns how many there are.
+    """
+    low, high, within, inside, limit = 0.0, FAR, 0, count, guess
+    for number in range(ROUNDS):
+        if inside == k:
+            break
+        nearer = 0
+        for i in range(count):
+            nearer += dist[i] <= limit
+        if nearer < k:
+            low, within = limit, nearer
+        else:
+            high, inside = limit, nearer
+        if high == FAR:
+            limit *= 2
+        elif number % 3 == 2:
+            limit = 0.5 * (low + high)
+        else:
+            limit = low + (high - low) * ((k - within) / (inside - within))
+        if not low < limit < high:
+            break
+    kept = 0
+    for i in range(count):
+        near, index = dist[i], ids[i]
+        dist[kept], ids[kept] = near, index
+        kept += near <= high
+    return kept
+
+
+@kernel(exact=True, inner=True)
+def _put_in_order(dist: Floats, ids: Ints, ranks: Ints, count: int, guess: float, idx: Ints, dist_sq: Floats) -> None:
+    """The nearest of `count` points, by distance and then by index, as many as idx (k,) and dist_sq (k,) hold.
+
+    guess: of the squared distance of the last of them.
+    """
+    k = len(idx)
+    count = _sift(dist, ids, count, k, guess)
+    if count > 2 * k + LEAF:
+        _keep_nearest(dist, ids, count, k)
+        count = k
+    total = 0
+    for i in range(count):
+        rank = 0
+        for j in range(count):
+            rank += dist[j] < dist[i]
+        ranks[i] = rank
+        total += rank
+    if 2 * total < count * (count - 1):  # some are equally far
+        for i in range(count):
+            for j in range(count):
+                ranks[i] += (dist[j] == dist[i]) & (ids[j] < ids[i])
+    for i in range(count):
+        if ranks[i] < k:
+            idx[ranks[i]], dist_sq[ranks[i]] = ids[i], dist[i]
+
+
+@kernel(exact=True, inner=True)
 def _to_boxes(x: float, y: float, z: float, box: Floats, far: Floats) -> None:
     """Squared distances (CHILDREN,) of a place to boxes (6, CHILDREN)."""
     for child in range(CHILDREN):
@@ -199,6 +268,59 @@ def _within(
     return count
 
 
+@kernel(exact=True, inner=True)
+def _around(
+    middle: Floats, limit: float, axes: Floats, ids: Ints, boxes: Floats, levels: Ints,
+    far: Floats, stack: Ints, dist: Floats, crowd: Floats, crowd_ids: Ints,
+) -> int:  # fmt: skip
+    """All points within a squared radius, in any order: crowd (3, room), crowd_ids (room,). -1: there is no room."""
+    x, y, z = middle
+    count, depth = 0, 1
+    stack[0, 0], stack[0, 1] = len(levels) - 2, 0
+    while depth:
+        depth -= 1
+        level, group = stack[depth]
+        _to_boxes(x, y, z, boxes[levels[level] + group], far)
+        for child in range(CHILDREN):
+            if far[child] > limit:
+                continue
+            below = group * CHILDREN + child
+            if level:
+                stack[depth, 0], stack[depth, 1] = level - 1, below
+                depth += 1
+                continue
+            if count + LEAF > len(crowd_ids):
+                return -1
+            first = below * LEAF
+            for i in range(LEAF):
+                dx, dy, dz = axes[0, first + i] - x, axes[1, first + i] - y, axes[2, first + i] - z
+                dist[i] = dx * dx + dy * dy + dz * dz
+            for i in range(LEAF):
+                crowd_ids[count] = first + i
+                count += dist[i] <= limit
+    for i in range(count):
+        place = crowd_ids[i]
+        for axis in range(3):
+            crowd[axis, i] = axes[axis, place]
+        crowd_ids[i] = ids[place]
+    return count
+
+
+@kernel(exact=True, inner=True)
+def _middle(queries: Floats, first: int, stop: int, middle: Floats) -> float:
+    """The mean of some queries -> middle (3,), and the largest squared distance of one from it."""
+    widest = 0.0
+    for axis in range(3):
+        total = 0.0
+        for q in range(first, stop):
+            total += queries[q, axis]
+        middle[axis] = total / (stop - first)
+    for q in range(first, stop):
+        dx, dy, dz = queries[q, 0] - middle[0], queries[q, 1] - middle[1], queries[q, 2] - middle[2]
+        widest = max(widest, dx * dx + dy * dy + dz * dz)
+    return widest
+
+
 @kernel(
     "void(float64[:, ::1], int64, float64[:, ::1], int64[::1], float64[:, :, ::1], int64[::1], int64[:, ::1],"
     " float64[:, ::1])",
@@ -211,14 +333,30 @@ def _search(
     n = len(ids)
     while n and axes[0, n - 1] == NOWHERE:
         n -= 1
-    room = ROOM * k + 4 * LEAF * CHILDREN
-    dist, found, sorted_ = np.empty(room), np.empty(room, np.int64), np.empty(room, np.int64)
+    room = max(ROOM * k + 4 * LEAF * CHILDREN, CROWD)
+    dist, found, ranks = np.empty(room), np.empty(room, np.int64), np.empty(room, np.int64)
     nearby = np.empty(max(room, CHILDREN * k + LEAF * CHILDREN))
     nearby_ids = np.empty(len(nearby), np.int64)
     far, stack = np.empty(CHILDREN), np.empty((24 * CHILDREN, 2), np.int64)
-    limit, grow = -1.0, 1 + MORE / np.sqrt(k)
+    crowd, crowd_ids, middle = np.empty((3, CROWD)), np.empty(CROWD, np.int64), np.empty(3)
+    limit, grow, around, reach = -1.0, 1 + MORE / np.sqrt(k), 0, 0.0
     for q in range(len(queries)):
         x, y, z = queries[q]
+        if q % TOGETHER == 0:
+            widest, around = _middle(queries, q, min(q + TOGETHER, len(queries)), middle), 0
+            if limit > TINY and widest < SPREAD * limit:
+                reach = np.sqrt(widest) + np.sqrt(limit * grow)
+                around = _around(middle, reach * reach, axes, ids, boxes, levels, far, stack, dist, crowd, crowd_ids)
+        if around >= k:
+            for i in range(around):
+                dx, dy, dz = crowd[0, i] - x, crowd[1, i] - y, crowd[2, i] - z
+                dist[i], found[i] = dx * dx + dy * dy + dz * dz, crowd_ids[i]
+            _put_in_order(dist, found, ranks, around, limit, idx[q], dist_sq[q])
+            dx, dy, dz = x - middle[0], y - middle[1], z - middle[2]
+            sure = (1 - ROUNDING) * reach - np.sqrt(dx * dx + dy * dy + dz * dz)  # so near all points are in the crowd
+            if sure > 0 and dist_sq[q, k - 1] < sure * sure:
+                limit = dist_sq[q, k - 1]
+                continue
         count = 0
         if limit >= 0:
             count = _within(x, y, z, limit * grow, k, axes, ids, boxes, levels, far, stack, dist, found)
@@ -227,15 +365,5 @@ def _search(
             count = _within(x, y, z, limit, k, axes, ids, boxes, levels, far, stack, dist, found)
         if count < 0:
             count = _within(x, y, z, 0.0, k, axes, ids, boxes, levels, far, stack, dist, found)
-        if count > 2 * k + LEAF:
-            _keep_nearest(dist, found, count, k)
-            count = k
-        for i in range(count):
-            rank = 0
-            for j in range(count):
-                rank += (dist[j] < dist[i]) | ((dist[j] == dist[i]) & (found[j] < found[i]))
-            sorted_[i] = rank
-        for i in range(count):
-            if sorted_[i] < k:
-                idx[q, sorted_[i]], dist_sq[q, sorted_[i]] = found[i], dist[i]
+        _put_in_order(dist, found, ranks, count, limit, idx[q], dist_sq[q])
         limit = dist_sq[q, k - 1]

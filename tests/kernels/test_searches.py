@@ -56,6 +56,22 @@ def test_neighbors_are_those_of_all_distances(n: int, k: int, kind: str) -> None
 
 
 @pytest.mark.usefixtures("compiled")
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("k", [1, 7, 33])
+def test_neighbors_of_queries_that_lie_together(k: int, kind: str) -> None:
+    points = cloud(kind, 1000)
+    apart = np.median(nearest(points, points, 4)[0][:, 3]) ** 0.5
+    for push in (0.0, 0.3, 5.0):  # of four around each point, in spacings
+        queries = np.repeat(points, 4, 0)
+        queries += push * apart * np.random.default_rng(k).normal(size=queries.shape)
+        dist_sq, idx = PointTree(points).nearest_sq(queries, k)
+        expected, expected_idx = nearest(queries, points, k)
+        np.testing.assert_array_equal(dist_sq, expected)
+        if kind != "equal":
+            np.testing.assert_array_equal(idx, expected_idx)
+
+
+@pytest.mark.usefixtures("compiled")
 @pytest.mark.parametrize("kind", ["random", "lattice", "equal", "repeated"])
 def test_neighbors_depend_neither_on_the_order_of_queries_nor_on_threads(kind: str) -> None:
     points, mixed = cloud(kind, 5000), np.random.default_rng(0).permutation(5000)
