@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from pnu.cleaning.outliers import MANY, stray_points
 from pnu.geometry.anisotropy import averaged, thinned_lines
-from pnu.geometry.cloud_normals import contradiction, settled_normals
+from pnu.geometry.cloud_normals import camera_sight, camera_words, contradiction, settled_normals
 from pnu.geometry.noise_level import noise_level
+from pnu.geometry.single_view import camera_place
 from pnu.geometry.spacing import spacing
 from pnu.io import Cloud
 from pnu.io.cloud import chosen
@@ -31,6 +32,7 @@ class Cleaned(NamedTuple):
     stray: NDArray[np.int64]  # rows of the cloud before that were taken out as stray
     character: Character = "clean"  # of a cloud without normals; what has them is "clean"
     estimated: NDArray[np.float64] | None = None  # normals (n, 3) of the cloud, where they had to be known to tell
+    camera: NDArray[np.float64] | None = None  # place (3,) from which all of a cloud without normals was seen
 
 
 def clean_cloud(
@@ -54,12 +56,12 @@ def clean_cloud(
     for name, value in (("outliers", outliers), ("lines", lines), ("signs", signs)):
         if value not in TREATMENTS:
             raise ValueError(f"{name}={value}: expected auto or keep")
-    stray = np.flatnonzero(stray_points(cloud.points)) if outliers == "auto" else np.empty(0, np.int64)
+    camera = camera_place(cloud.points) if cloud.normals is None else None
+    stray = np.flatnonzero(stray_points(cloud.points, camera)) if outliers == "auto" else np.empty(0, np.int64)
     notes = list(cloud.notes)
     if len(stray):
-        notes.append(
-            f"{len(stray)} of {len(cloud.points)} points left out: stray, they lie off the surface (outliers=keep)"
-        )
+        how = "they lie off the surface" if camera is None else f"torn off at edges, as a {camera_words(camera)} saw"
+        notes.append(f"{len(stray)} of {len(cloud.points)} points left out: stray, {how} (outliers=keep)")
         cloud = chosen(cloud, np.setdiff1d(np.arange(len(cloud.points)), stray))
     rows = thinned_lines(cloud.points) if lines == "auto" and cloud.normals is None else None
     if rows is not None:
@@ -71,15 +73,20 @@ def clean_cloud(
         settled = settled_normals(cloud.points, cloud.normals)
         notes.append(f"normals: {settled.words} (normals=keep)")
         cloud = cloud._replace(normals=settled.normals)
-    cloud, share = cloud._replace(notes=tuple(notes)), len(stray) / (len(stray) + len(cloud.points))
+    share = len(stray) / (len(stray) + len(cloud.points))
+    found = Cleaned(cloud._replace(notes=tuple(notes)), stray, camera=camera)
+    if cloud.normals is not None:
+        return found
+    scanned = found._replace(character="scanned" if share > MANY or camera is not None else "clean")
     if rows is not None:
-        return Cleaned(cloud, stray, "scanned")
-    if cloud.normals is None and is_noisy(cloud.points):  # or has thin walls, whose sides normals tell apart
-        estimated = settled_normals(cloud.points, None).normals
-        if is_noisy(cloud.points, estimated):
-            return Cleaned(cloud, stray, noisy_character(cloud.points), estimated)
-        return Cleaned(cloud, stray, "scanned" if share > MANY else "clean", estimated)
-    return Cleaned(cloud, stray, "scanned" if cloud.normals is None and share > MANY else "clean")
+        return scanned._replace(character="scanned")
+    if not is_noisy(cloud.points):  # nor has it thin walls, whose sides normals tell apart
+        return scanned
+    sight = None if camera is None else camera_sight(camera)
+    estimated = settled_normals(cloud.points, None, found=sight).normals
+    if is_noisy(cloud.points, estimated):
+        return found._replace(character=noisy_character(cloud.points), estimated=estimated)
+    return scanned._replace(estimated=estimated)
 
 
 def noisy_character(points: NDArray[np.float64]) -> Character:

@@ -1,4 +1,8 @@
-"""Stray points: those that measure nothing, found by a small trained network and taken out."""
+"""Stray points: those that measure nothing, found by small trained networks and taken out.
+
+One network looks at how a point lies among its neighbors in space. Where one camera saw all points, another looks at
+how its depth fits to that of the pixels around it, which tells points torn off at edges from surfaces seen at a slant.
+"""
 
 from functools import cache
 from pathlib import Path
@@ -8,16 +12,19 @@ from numpy.typing import NDArray
 
 from pnu.geometry.connected_parts import connected_parts
 from pnu.geometry.outlier_features import outlier_features
+from pnu.geometry.pixel_features import pixel_features
 from pnu.geometry.point_tree import PointTree
 from pnu.runtime.threads import thread_count
 
-WEIGHTS = Path(__file__).with_name("outliers.safetensors")
+WEIGHTS = Path(__file__).parent  # both trained by pnu.training.outlier_training
 SURE = 3.0  # logarithm of the odds from which on a point is taken for stray,
+TORN = 3.5  # in the picture of a camera,
 LIKELY = 1.2  # or this where there are many: a share of
 MANY = 0.0035  # of the points is sure; noise of 1 % of the radius stays below
 ROUNDS = 3  # a stray point hides another,
 SINGLE = 3  # but so few of them none
-PIECE = 12  # points below which a piece that stands apart is stray
+PIECE = 12  # points below which a piece that stands apart is stray,
+SPECK = 4  # and in the picture of a camera, of whose edges it may be all that is seen
 APART = 6.0  # usual spacings between a piece and all others
 EVEN = 0.45  # breadth of the middle 80 % of nearest distances over their median, below which points keep a distance
 FITS = (0.6, 1.6)  # nearest distances over those around, of points that fit into such an order
@@ -28,16 +35,16 @@ FEWEST = 64  # points of a cloud in which strays can be told
 
 
 @cache
-def detector_weights() -> dict[str, NDArray[np.float32]]:
-    """Those of the `pnu.networks.outlier_detector.OutlierDetector` that comes with pnu, by their names."""
+def detector_weights(name: str) -> dict[str, NDArray[np.float32]]:
+    """Those of a `pnu.networks.outlier_detector.OutlierDetector` that comes with pnu, "outliers" or "torn"."""
     from safetensors.numpy import load_file
 
-    return load_file(WEIGHTS)
+    return load_file(WEIGHTS / f"{name}.safetensors")
 
 
-def stray_odds(features: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Logarithm of the odds that each point is stray, (n,), of features (n, 52): what the detector computes."""
-    weights = detector_weights()
+def stray_odds(features: NDArray[np.float32], name: str = "outliers") -> NDArray[np.float32]:
+    """Logarithm of the odds that each point is stray, (n,), of features (n, 52) or (n, 34), as a detector does."""
+    weights = detector_weights(name)
     values = (features - weights["mean"]) / weights["deviation"]
     for layer in (0, 2, 4):
         values = values @ weights[f"layers.{layer}.weight"].T + weights[f"layers.{layer}.bias"]
@@ -46,11 +53,23 @@ def stray_odds(features: NDArray[np.float32]) -> NDArray[np.float32]:
     return values[:, 0]
 
 
-def stray_points(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which of the points (n, 3) are stray, (n,): by the detector, but for those that fit in; then small pieces.
+def stray_points(points: NDArray[np.float64], camera: NDArray[np.float64] | None = None) -> NDArray[np.bool_]:
+    """Which of the points (n, 3) are stray, (n,): what the detector finds, then small pieces.
 
     Rows may be in any order; place, rotation and size have no influence. Clouds of fewer than 64 points have none.
+    camera: the place (3,) from which all were seen, one a pixel (`pnu.geometry.single_view.camera_place`).
     """
+    stays = np.ones(len(points), bool)
+    if len(points) >= FEWEST:
+        stays = _in_space(points) if camera is None else stray_odds(pixel_features(points, camera), "torn") <= TORN
+    rows = np.flatnonzero(stays)
+    if len(rows) >= FEWEST:
+        stays[rows[small_pieces(points[rows], PIECE if camera is None else SPECK)]] = False
+    return ~stays
+
+
+def _in_space(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which points (n, 3) stay, (n,): all but those that the detector finds and that neither fit in nor go on."""
     stays, enough = np.ones(len(points), bool), SURE
     for _ in range(ROUNDS):
         rows = np.flatnonzero(stays)
@@ -67,10 +86,7 @@ def stray_points(points: NDArray[np.float64]) -> NDArray[np.bool_]:
             break
     if stays.sum() >= FEWEST and not stays.all():
         stays[~stays] = continue_surface(points[~stays], points[stays])
-    rows = np.flatnonzero(stays)
-    if len(rows) >= FEWEST:
-        stays[rows[small_pieces(points[rows])]] = False
-    return ~stays
+    return stays
 
 
 def continue_surface(points: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -106,13 +122,13 @@ def fit_in_order(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     return fits
 
 
-def small_pieces(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which of the points (n, 3) belong to a piece of fewer than 12 that stands apart from all others, (n,)."""
+def small_pieces(points: NDArray[np.float64], fewest: int = PIECE) -> NDArray[np.bool_]:
+    """Which of the points (n, 3) belong to a piece of fewer than `fewest` that stands apart from all others, (n,)."""
     k = min(PIECE, len(points) - 1)
     distance, near = PointTree(points).among_themselves(k + 1, threads=thread_count())
     reach = APART * np.median(distance[near, min(5, k - 1)], 1)
     linked = distance <= np.maximum(reach[:, None], reach[near])
     first = np.broadcast_to(np.arange(len(points))[:, None], near.shape)[linked]
     piece = connected_parts(first, near[linked], len(points))
-    small: NDArray[np.bool_] = (np.bincount(piece) < PIECE)[piece]
+    small: NDArray[np.bool_] = (np.bincount(piece) < fewest)[piece]
     return small

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
 
     from pnu.cleaning import Cleaned
     from pnu.io import Cloud
+    from pnu.io.sensor import Sight
 
 CHOICES = ("auto", "orient", "estimate", "keep")
 NORMALS = (
@@ -32,9 +33,10 @@ def check_sides(cfg: Any) -> None:
         raise ValueError(f"{name}={cfg[name]}: decides nothing where normals=keep; take normals=orient")
 
 
-def sided(cfg: Any, cloud: "Cloud", *, learned: bool = True) -> tuple["Cloud", str]:
+def sided(cfg: Any, cloud: "Cloud", *, learned: bool = True, places: "Sight | None" = None) -> tuple["Cloud", str]:
     """A cloud with a normal for each point, as the keys and the file say, and a line on them, which is the last of its
-    notes where something was done. Without `learned` those that are estimated are plane fits."""
+    notes where something was done. Without `learned` those that are estimated are plane fits. places: what those of the
+    points say, where that is known already."""
     from pnu.geometry.cloud_normals import settled_normals
     from pnu.io.sensor import asked_sight, sight_of
     from pnu.upsamplers.learned_normals import learned_normals
@@ -45,7 +47,7 @@ def sided(cfg: Any, cloud: "Cloud", *, learned: bool = True) -> tuple["Cloud", s
             cloud.normals,
             choice=cfg.normals,
             asked=asked_sight(cfg.viewpoint, cfg.up, cfg.side),
-            found=sight_of(cfg.input, cloud.attributes),
+            found=sight_of(cfg.input, cloud.attributes) or places,
             refine=learned_normals if learned else None,
             progress=progress,
         )
@@ -64,11 +66,12 @@ def cleaned(cfg: Any, cloud: "Cloud", **treatments: Any) -> tuple["Cleaned", "ND
     from pnu.io.sensor import asked_sight, sight_of
 
     told = asked_sight(cfg.viewpoint, cfg.up, cfg.side) is not None or cfg.normals == "orient"
-    told = told or sight_of(cfg.input, cloud.attributes) is not None or sight_by_places(cloud.points) is not None
+    places = sight_by_places(cloud.points)
+    told = told or sight_of(cfg.input, cloud.attributes) is not None or places is not None
     found = clean_cloud(cloud, **treatments, signs="keep" if told or cfg.normals == "keep" else "auto")
     own = found.cloud.normals
     if told:
-        found = found._replace(cloud=sided(cfg, found.cloud, learned=False)[0])
+        found = found._replace(cloud=sided(cfg, found.cloud, learned=False, places=places)[0])
     elif found.estimated is not None and str(cfg.get("keep")).lower() != "true":  # points kept get the network's
         found = found._replace(cloud=found.cloud._replace(normals=found.estimated))
     return found, own

@@ -68,7 +68,7 @@ def scan(cfg: Any) -> None:
 
     wanted = cfg.ratio if cfg.spacing is None else whole_clouds.ratio_of_spacing(before.points, cfg.spacing)
     count = whole_clouds.output_count(len(before.points), wanted)
-    (cloud, stray, character, _), own = _sides.cleaned(cfg, before)
+    (cloud, stray, character, *_), own = _sides.cleaned(cfg, before)
     look = describe_cloud(cloud.points, cloud.normals)
     for text in (*cloud.notes, str(look), *look.warnings()):
         say(f"        {text}")

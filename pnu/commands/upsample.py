@@ -107,7 +107,7 @@ def upsample(cfg: Any) -> None:
     wanted = cfg.ratio if cfg.spacing is None else whole_clouds.ratio_of_spacing(cloud.points, cfg.spacing)
     count, before = whole_clouds.output_count(len(cloud.points), wanted), cloud
     keep = {"true": True, "false": False}.get(str(cfg.keep).lower(), cfg.keep)
-    (cloud, stray, character, _), own = _sides.cleaned(
+    (cloud, stray, character, *_), own = _sides.cleaned(
         cfg, cloud, outliers=cfg.outliers, lines="keep" if keep is True else cfg.lines
     )
     for note in cloud.notes[len(before.notes) :]:

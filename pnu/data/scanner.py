@@ -43,7 +43,9 @@ class DepthCamera:
         step: of depth; 0: none
         turn: by which views are misaligned, standard deviation in degrees
         shift: the same in lengths
-        torn: share of the points at edges of depth that float between front and background
+        torn: share of the points at edges of depth that float between front and background,
+        in_place: instead of the points there, one a pixel, as a camera has it; else beside them
+        false: share of the pixels whose depth is any
     """
 
     distance: float = 3.0
@@ -56,6 +58,8 @@ class DepthCamera:
     turn: float = 0.0
     shift: float = 0.0
     torn: float = 0.0
+    in_place: bool = False
+    false: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -147,11 +151,17 @@ class Scanner:
         torn = rng.choice(edge, round(camera.torn * len(edge)), replace=False)
         between = measured[torn] + rng.uniform(0.02, 0.4, len(torn))
         measured, rays = np.concatenate([measured, between]), np.vstack([rays, rays[torn]])
+        stray = np.arange(len(measured)) >= len(clean)
+        clean = np.vstack([clean, clean[torn]])
+        if camera.false:
+            wrong = rng.choice(len(measured), round(camera.false * len(measured)), replace=False)
+            measured[wrong] = camera.distance + rng.uniform(-1, 1, len(wrong))
+            stray[wrong] = True
         points = (sensor + measured[:, None] * rays) @ turn.T + shift
-        stray = np.arange(len(points)) >= len(clean)
-        return SimulatedScan(
-            points, None, np.vstack([clean, clean[torn]]), np.broadcast_to(sensor, points.shape), stray
-        )
+        if camera.in_place:
+            stays = np.setdiff1d(np.arange(len(points)), torn)
+            points, clean, stray = points[stays], clean[stays], stray[stays]
+        return SimulatedScan(points, None, clean, np.broadcast_to(sensor, points.shape), stray)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "scene": None}  # a scene cannot be pickled

@@ -10,7 +10,7 @@ from pnu.geometry.flipped_parts import flipped_share
 from pnu.geometry.normal_estimation import complete_normals, orient_normals
 from pnu.geometry.normal_sides import repaired_signs, seen_signs
 from pnu.geometry.orientation import NeighborCloud, is_closed
-from pnu.geometry.single_view import is_camera, seen_from_one_side
+from pnu.geometry.single_view import camera_place, seen_from_one_side
 from pnu.geometry.unit_sphere import unit_sphere_frame
 from pnu.io.sensor import Sight
 from pnu.runtime.progress import Progress, silent
@@ -105,12 +105,21 @@ def contradiction(points: np.ndarray, normals: np.ndarray) -> str:
 
 
 def sight_by_places(points: np.ndarray) -> Sight | None:
-    """From where points (n, 3) were seen, as these say: as a map of heights, or by a camera at the origin."""
+    """From where points (n, 3) were seen, as these say: as a map of heights, or by a camera at some place."""
     if is_height_map(points):
         return Sight("up, as a map of heights", up=UP)
-    if is_camera(np.zeros(3), points):
-        return Sight("towards a camera at the origin, whose pixels they are", viewpoint=np.zeros(3))
-    return None
+    place = camera_place(points)
+    return None if place is None else camera_sight(place)
+
+
+def camera_sight(place: np.ndarray) -> Sight:
+    """That of a camera whose place (3,) was found."""
+    return Sight(f"towards a {camera_words(place)}, whose pixels they are", viewpoint=place)
+
+
+def camera_words(place: np.ndarray) -> str:
+    """Such a camera and about where it is."""
+    return f"camera at {','.join(f'{value:.3g}' for value in place) if place.any() else 'the origin'}"
 
 
 def is_height_map(points: np.ndarray) -> bool:

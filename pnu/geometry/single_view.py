@@ -1,13 +1,14 @@
-"""From where a cloud was seen, told by its points alone: by a camera at the origin, or all from one side.
+"""From where a cloud was seen, told by its points alone: by a camera at some place, or all from one side.
 
-A camera's points lie one a pixel: seen from its place, in even rows and columns. Along the way to it nothing lies
-behind anything else; along any other way the front and the back of what bends fall together. So of many directions that
-one is the camera's along which no two points lie behind each other, if there is such a one; around closed shapes there
-is none.
+A camera's points lie one a pixel: seen from its place, in even rows and columns, and from no other place. Along the way
+to it nothing lies behind anything else; along any other way the front and the back of what bends fall together. So of
+many directions that one is the camera's along which no two points lie behind each other, if there is such a one; around
+closed shapes there is none.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +24,8 @@ from pnu.runtime.threads import thread_count
 Floats = NDArray[np.float64]
 
 FEWEST, MOST = 200, 2048  # points that tell, and that are looked at
-DIRECTIONS = 300  # of a half of the sphere
+DIRECTIONS = 300  # of a half of the sphere,
+AT_ONCE = 50  # looked along at once
 CELL, BEHIND = 0.5, 3.0  # spacings across in which two points are on one ray, and along, from which one is behind
 CLEAR, SHARE = 0.02, 0.2  # of the points, and of the usual share, that may lie behind others
 ALIKE = 0.002  # directions that differ by less see the same
@@ -32,6 +34,16 @@ BLOCK = 4096  # points in which pixels are looked for:
 SAME, SQUARE = 1.1, 1.35  # angles to the second and the fourth neighbor, over the nearest's, that are hardly wider,
 PAIRS, FOURS = 0.85, 0.7  # and the shares of the points that have them
 STEEP, FLAT = 0.95, 0.25  # of land: cosine of the way it was seen with z; height over its extent
+GLANCE = 512, 80  # points and directions of a first look for a camera somewhere,
+HIDDEN, CLOSE = (
+    0.06,
+    0.03,
+)  # share of points behind others above which there is none; more than the least in a way tried
+TRIED, STARTS = 20, 3  # ways that are tried, both of their ends, and those of them the search starts from
+AWAY, STEP = 2.8, 0.35  # radii to a camera at first, and by which the search begins to move it
+WATCHED = 256  # points whose neighbors' angles are compared,
+WIDEST = 0.5  # logarithm by which one counts at most
+UNLIKELY, UNEVEN = 0.21, 0.07  # mean logarithm by which they differ, above which a way, or a place, is none to a camera
 
 
 def is_camera(place: Floats, points: Floats) -> bool:
@@ -63,11 +75,69 @@ def single_view(points: Floats) -> Floats | None:
     if len(points) > MOST:
         points = points[farthest_points_large(points, MOST)]
     apart, directions = spacing(points), sphere_directions(2 * DIRECTIONS)[:DIRECTIONS]
-    behind = np.array([_share_behind(points, direction, apart) for direction in directions])
+    behind = _shares_behind(points, directions, apart)
     if behind.min() > min(CLEAR, SHARE * float(np.median(behind))):
         return None
     clear = directions[behind <= behind.min() + ALIKE]
     return np.asarray(np.linalg.eigh(clear.T @ clear)[1][:, -1])
+
+
+def camera_place(points: Floats) -> Floats | None:
+    """The place (3,) from which a camera saw all points (n, 3), one a pixel; None: there is no such place.
+
+    It is sought (Nelder and Mead 1965) where the angles between rays to neighboring points are the most alike, from
+    directions along which hardly a point lies behind another. Points that float behind edges do not matter, and neither
+    does the order of the points. Some hundredths of the distance it may be off, along the way to it most.
+    """
+    if len(points) < FEWEST:
+        return None
+    if is_camera(np.zeros(3), points):
+        return np.zeros(3)
+    return _camera_of(np.ascontiguousarray(points[np.lexsort(points.T)], np.float64).tobytes())
+
+
+@lru_cache(maxsize=4)  # several stages ask for that of the same points
+def _camera_of(data: bytes) -> Floats | None:
+    points = np.frombuffer(data).reshape(-1, 3)
+    middle = points.mean(0)
+    radius = float(np.linalg.norm(points - middle, axis=1).max())
+    if not radius > 0:
+        return None
+    unit = (points - middle) / radius
+    count, tried = GLANCE
+    some = unit if len(unit) <= count else unit[farthest_points_large(unit, count)]
+    directions = sphere_directions(2 * tried)[:tried]
+    behind = _shares_behind(some, directions, spacing(some))
+    if behind.min() > HIDDEN:
+        return None
+    ways = directions[behind <= behind.min() + CLOSE]
+    if len(ways) > TRIED:
+        ways = ways[farthest_points_large(ways, TRIED)]
+    starts = AWAY * np.concatenate([ways, -ways])
+    block = unit if len(unit) <= MOST else unit[np.argpartition((unit**2).sum(1), MOST)[:MOST]]
+    watched = np.linspace(0, len(block) - 1, min(WATCHED, len(block))).astype(int)
+
+    def unevenness(place: Floats) -> float:
+        """Mean absolute logarithm of angles to the second and third neighbor over the usual one."""
+        rays = block - place
+        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-300)
+        angles = PointTree(rays).nearest(rays[watched], 4)[0][:, 2:]
+        logarithms = np.log(np.maximum(angles, 1e-12))
+        return float(np.minimum(np.abs(logarithms - np.median(logarithms)), WIDEST).mean())
+
+    first = np.array([unevenness(start) for start in starts])
+    if first.min() > UNLIKELY:
+        return None
+    from scipy.optimize import minimize  # takes a moment to load
+
+    for start in starts[np.argsort(first, kind="stable")[:STARTS]]:
+        simplex = start + STEP * np.vstack([np.zeros(3), np.eye(3)])
+        options = {"initial_simplex": simplex, "maxfev": 150, "xatol": 1e-3, "fatol": 1e-3}
+        found = minimize(unevenness, start, method="Nelder-Mead", options=options)
+        if found.fun < UNEVEN:
+            away = float(np.linalg.norm(found.x))
+            return middle + radius * found.x if NEAREST < away < FARTHEST else None
+    return None
 
 
 class OneSide(NamedTuple):
@@ -93,11 +163,18 @@ def seen_from_one_side(points: Floats, normals: Floats) -> OneSide | None:
     return OneSide(normals * signs[:, None], land)
 
 
-def _share_behind(points: Floats, direction: Floats, apart: float) -> float:
-    """Share of points (n, 3) behind another on the same ray along a direction (3,), where points lie so far apart."""
-    aside = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
-    aside /= np.linalg.norm(aside)
-    column, row, depth = np.stack([aside, np.cross(direction, aside), direction]) @ points.T / apart
-    ray = np.floor(column / CELL) * 2.0**26 + np.floor(row / CELL)
-    order = np.argsort(ray)
-    return float(((np.diff(ray[order]) == 0) & (np.abs(np.diff(depth[order])) > BEHIND)).mean())
+def _shares_behind(points: Floats, directions: Floats, apart: float) -> Floats:
+    """Share of points (n, 3) behind another on the same ray along each direction (m, 3), where points lie so far apart:
+    (m,)."""
+    aside = np.cross(directions, np.eye(3)[np.abs(directions).argmin(1)])
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    axes = np.stack([aside, np.cross(directions, aside), directions], 1) / apart
+    found = np.empty(len(directions))
+    for first in range(0, len(directions), AT_ONCE):
+        column, row, depth = np.moveaxis(axes[first : first + AT_ONCE] @ points.T, 1, 0)
+        ray = np.floor(column / CELL) * 2.0**26 + np.floor(row / CELL)
+        order = np.argsort(ray, axis=1)
+        same = np.diff(np.take_along_axis(ray, order, 1), axis=1) == 0
+        beyond = np.abs(np.diff(np.take_along_axis(depth, order, 1), axis=1)) > BEHIND
+        found[first : first + AT_ONCE] = (same & beyond).mean(1)
+    return found

@@ -1,4 +1,7 @@
-"""The network that finds stray points, from how each lies among its neighbors (`pnu.geometry.outlier_features`)."""
+"""The network that finds stray points, from how each lies among its neighbors: in space, or in a camera's picture.
+
+Their features are those of `pnu.geometry.outlier_features` and `pnu.geometry.pixel_features`.
+"""
 
 import torch
 from torch import Tensor, nn
@@ -7,17 +10,17 @@ from pnu.geometry.outlier_features import FEATURES
 
 
 class OutlierDetector(nn.Module):
-    """Features of points (n, 52) -> logarithm of the odds that each is stray, (n,)."""
+    """Features of points (n, features) -> logarithm of the odds that each is stray, (n,)."""
 
     mean: Tensor
     deviation: Tensor
 
-    def __init__(self, width: int = 64) -> None:
+    def __init__(self, features: int = FEATURES, width: int = 64) -> None:
         super().__init__()
-        self.register_buffer("mean", torch.zeros(FEATURES))
-        self.register_buffer("deviation", torch.ones(FEATURES))
+        self.register_buffer("mean", torch.zeros(features))
+        self.register_buffer("deviation", torch.ones(features))
         self.layers = nn.Sequential(
-            nn.Linear(FEATURES, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1)
+            nn.Linear(features, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1)
         )
 
     def forward(self, features: Tensor) -> Tensor:

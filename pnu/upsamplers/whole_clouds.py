@@ -17,7 +17,7 @@ import numpy as np
 from pnu import __version__
 from pnu.cleaning import Character, Treatment, clean_cloud
 from pnu.geometry.attributes import carry
-from pnu.geometry.cloud_normals import check_not_a_line, settled_normals
+from pnu.geometry.cloud_normals import camera_sight, check_not_a_line, settled_normals
 from pnu.geometry.normal_estimation import complete_normals
 from pnu.geometry.point_tree import PointTree
 from pnu.geometry.unit_sphere import Frame, unit_sphere_frame
@@ -204,7 +204,7 @@ def upsample(
         raise ValueError(f"merge={merge}: expected {' or '.join(get_args(Merge))}")
     if keep not in (True, False, "auto"):
         raise ValueError(f"keep={keep}: expected true, false or auto")
-    given, _, character, estimated = clean_cloud(
+    given, _, character, estimated, camera = clean_cloud(
         given, outliers=outliers, lines="keep" if keep is True else lines, signs=signs
     )
     network, target = on_device(*_model(model, given.normals, character, device), device)
@@ -214,7 +214,7 @@ def upsample(
     if merge == "agreed" and not getattr(upsampler, "merges", False):
         raise ValueError(f"merge=agreed: {type(network).__name__} has no patches that overlap; leave it out")
     names = _names(target, devices)
-    sparse, frame = _prepare(given, progress, estimated, refine=not getattr(network, "passes", 0))
+    sparse, frame = _prepare(given, progress, estimated, camera, refine=not getattr(network, "passes", 0))
     if not getattr(upsampler, "follows", False) and (density == "follow" or keep is True):
         asked = "density=follow" if density == "follow" else "keep=true"
         raise ValueError(
@@ -488,12 +488,17 @@ def _digest(network: Any, sparse: np.ndarray, count: int, upsampler: object, *op
 
 
 def _prepare(
-    cloud: Cloud, progress: Progress, estimated: np.ndarray | None = None, *, refine: bool = False
+    cloud: Cloud,
+    progress: Progress,
+    estimated: np.ndarray | None = None,
+    camera: np.ndarray | None = None,
+    *,
+    refine: bool = False,
 ) -> tuple[np.ndarray, Frame]:
     """The points in a fixed order with normals, (n, 6) float64 in the unit sphere, and the way back.
 
-    estimated: normals (n, 3), known already, that a cloud without any gets. refine: those that are missing are found by
-    the surface model, not left to a network that does so itself.
+    estimated: normals (n, 3), known already, that a cloud without any gets; or camera: the place (3,) that saw it all.
+    refine: those that are missing are found by the surface model, not left to a network that does so itself.
     """
     order = np.lexsort(cloud.points.T)
     unit, frame = _unit_sphere(cloud.points[order])
@@ -502,7 +507,10 @@ def _prepare(
     if missing.any():
         progress("normals", 0, 1)
         if given is None:
-            directions = (settled_normals(cloud.points, None).normals if estimated is None else estimated)[order]
+            if estimated is None:
+                sight = None if camera is None else camera_sight(camera)
+                estimated = settled_normals(cloud.points, None, found=sight).normals
+            directions = estimated[order]
         else:
             directions = complete_normals(unit, given)
         if refine:

@@ -12,11 +12,13 @@ from pnu.cleaning import clean_cloud
 from pnu.cleaning.outliers import continue_surface, small_pieces, stray_points
 from pnu.commands.upsample import main
 from pnu.data import shapes
-from pnu.data.scanner import KINDS, Scanner
+from pnu.data.scanner import KINDS, DepthCamera, Scanner, random_turn
 from pnu.geometry.anisotropy import averaged, evenness, thinned_lines
 from pnu.geometry.mesh_sampling import sample_area
 from pnu.geometry.outlier_features import FEATURES, NEIGHBORS, outlier_features
+from pnu.geometry.sphere_directions import sphere_directions
 from pnu.io import Cloud, read_cloud
+from pnu.training.outlier_training import examples_of_pictures, train_detector
 from pnu.upsamplers.inference import weights_source
 
 
@@ -229,3 +231,33 @@ def test_a_cloud_that_thins_out_keeps_its_thin_end() -> None:
         good = ~scan.stray & (np.linalg.norm(scan.points - scan.clean[:, :3], axis=1) < 0.015)
         lost.append((stray_points(scan.points) & good).sum() / good.sum())
     assert np.mean(lost) < 0.003
+
+
+@pytest.mark.parametrize(("in_place", "most"), [(True, 0.2), (False, 0.02)])
+@pytest.mark.parametrize("name", ["person", "impeller"])
+def test_torn_points_of_a_depth_camera_go_and_slanted_walls_stay(name: str, in_place: bool, most: float) -> None:
+    torn = left = lost = 0
+    camera = DepthCamera(2.6, 0.42, 110, 110, slant=0.1, step=0.004, torn=0.25, in_place=in_place)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        scan = Scanner(shapes.make(name)).views(2.6 * sphere_directions(7, random_turn(rng))[:1], camera, rng)
+        cleaned = clean_cloud(Cloud(scan.points, None, {}))
+        assert cleaned.camera is not None
+        assert cleaned.character == "scanned"
+        assert "torn off at edges, as a camera at" in cleaned.cloud.notes[-1]
+        gone = np.isin(np.arange(len(scan.points)), cleaned.stray)
+        # those that are less off may lie on another surface
+        far = scan.stray & (np.linalg.norm(scan.points - scan.clean[:, :3], axis=1) > 0.1)
+        torn, left, lost = torn + far.sum(), left + (far & ~gone).sum(), lost + (gone & ~scan.stray).sum()
+    assert torn > 100
+    assert left < most * torn
+    assert lost < 0.1 * torn
+
+
+def test_the_network_for_pictures_is_trained_in_moments_on_a_shape() -> None:
+    examples = examples_of_pictures([shapes.make("teddy")], 0)
+    network = train_detector(examples, steps=60)
+    odds = network(examples.features).detach()
+    counts = examples.weight > 0
+    stray = examples.stray.bool()
+    assert (odds[stray].median() > odds[~stray & counts].quantile(0.98)).item()

@@ -6,8 +6,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import pnu
-from pnu.geometry.cloud_normals import FROM_ABOVE, ONE_SIDE, settled_normals
-from pnu.geometry.single_view import is_camera, seen_from_one_side, single_view
+from pnu.data import shapes
+from pnu.data.scanner import KINDS, Scanner
+from pnu.geometry.cloud_normals import FROM_ABOVE, ONE_SIDE, settled_normals, sight_by_places
+from pnu.geometry.mesh_sampling import sample_poisson_disk
+from pnu.geometry.single_view import camera_place, is_camera, seen_from_one_side, single_view
 
 Array = NDArray[np.float64]
 BALLS = np.array(
@@ -133,3 +136,46 @@ def test_land_looks_up() -> None:
         settled = settled_normals(land * [1, 1, flipped], None)
         assert (settled.normals[:, 2] > 0.3).mean() > 0.98
         assert settled.words == f"3000 estimated; side: {FROM_ABOVE}"
+
+
+@pytest.mark.parametrize(("name", "seed"), [("head", 0), ("nut", 1), ("dancer", 2), ("figure_eight", 3)])
+def test_the_place_of_a_camera_is_found(name: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scan = KINDS["oneview"](Scanner(shapes.make(name)), rng)
+    turn, scale, shift = Rotation.random(rng=rng).as_matrix(), 10 ** rng.uniform(-2, 3), 100 * rng.normal(size=3)
+    moved, sensor = (scale * values @ turn.T + shift for values in (scan.points, scan.sensor[0]))
+    place = camera_place(moved)
+    assert place is not None
+    way, found = sensor - moved.mean(0), place - moved.mean(0)
+    assert found @ way > np.cos(np.radians(10)) * np.linalg.norm(found) * np.linalg.norm(way)
+    assert 0.8 < np.linalg.norm(found) / np.linalg.norm(way) < 1.25
+    np.testing.assert_array_equal(camera_place(moved[rng.permutation(len(moved))]), place)
+    sight = sight_by_places(moved)
+    assert sight is not None
+    assert sight.words.startswith("towards a camera at ")
+
+
+def test_a_camera_is_not_found_where_there_was_none() -> None:
+    rng = np.random.default_rng(0)
+    turn = Rotation.random(rng=rng).as_matrix()
+    u, v = (grid.ravel() for grid in np.meshgrid(*[np.linspace(-1, 1, 50)] * 2))
+    bent = np.stack([u, v, 0.4 * np.sin(3 * u) * np.cos(2 * v)], 1)
+    random = rng.uniform(-1, 1, (3000, 2))
+    even = sample_poisson_disk(shapes.make("head"), 3000, rng)
+    clouds = {
+        "seen from afar, in even rows": bent @ turn.T,
+        "as it fell": np.column_stack([random, np.sin(3 * random[:, 0])]) @ turn.T,
+        "evenly spread over one side": even[even[:, 5] > 0.1, :3],
+        "evenly spread all around": even[:, :3],
+        "at random all around": around_balls(600),
+        "from ten sides": KINDS["orbit"](Scanner(shapes.make("head")), rng).points,
+        "too few": view_of_balls(14)[0],
+        "all at one place": np.ones((300, 3)),
+    }
+    assert {name: camera_place(points) for name, points in clouds.items()} == dict.fromkeys(clouds)
+
+
+def test_normals_of_a_flat_thing_look_to_the_camera_that_saw_it() -> None:
+    scan = KINDS["oneview"](Scanner(shapes.make("washer")), np.random.default_rng(4))
+    points, true = scan.points[~scan.stray], scan.clean[~scan.stray, 3:]
+    assert ((settled_normals(points, None).normals * true).sum(1) < 0).mean() < 0.01
