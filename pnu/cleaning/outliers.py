@@ -17,9 +17,9 @@ from pnu.geometry.point_tree import PointTree
 from pnu.runtime.threads import thread_count
 
 WEIGHTS = Path(__file__).parent  # both trained by pnu.training.outlier_training
-SURE = 3.0  # logarithm of the odds from which on a point is taken for stray,
+SURE = 3.5  # logarithm of the odds from which on a point is taken for stray,
 TORN = 3.5  # in the picture of a camera,
-LIKELY = 1.2  # or this where there are many: a share of
+LIKELY = 1.7  # or this where there are many: a share of
 MANY = 0.0035  # of the points is sure; noise of 1 % of the radius stays below
 ROUNDS = 3  # a stray point hides another,
 SINGLE = 3  # but so few of them none
