@@ -10,7 +10,7 @@ from pnu.geometry.flipped_parts import flipped_share
 from pnu.geometry.normal_estimation import complete_normals, orient_normals
 from pnu.geometry.normal_sides import repaired_signs, seen_signs
 from pnu.geometry.orientation import NeighborCloud, is_closed
-from pnu.geometry.single_view import camera_place, seen_from_one_side
+from pnu.geometry.single_view import camera_place, is_camera, seen_from_one_side
 from pnu.geometry.unit_sphere import unit_sphere_frame
 from pnu.io.sensor import Sight
 from pnu.runtime.progress import Progress, silent
@@ -74,9 +74,10 @@ def settled_normals(
         lines = np.where(known[:, None], lines, refine(unit, lines, progress))
     sight = asked or found or sight_by_places(points)
     if sight is not None and sight.viewpoint is not None:
-        center, scale = frame.center[0], frame.scale.item()
-        places = sight.viewpoint[order] if sight.viewpoint.ndim == 2 else sight.viewpoint
-        sight = sight._replace(viewpoint=(places - center) / scale)
+        of_each = sight.viewpoint.ndim == 2
+        places = sight.viewpoint[order] if of_each else sight.viewpoint
+        pixels = sight.pixels or (not of_each and is_camera(sight.viewpoint, points))
+        sight = sight._replace(viewpoint=(places - frame.center[0]) / frame.scale.item(), pixels=pixels)
     sign, side = _signs(unit, lines, known, anew, sight, repair=bool(why))
     progress("normals", 1, 1)
     sign = np.where(anew, sign, 1)
@@ -114,7 +115,7 @@ def sight_by_places(points: np.ndarray) -> Sight | None:
 
 def camera_sight(place: np.ndarray) -> Sight:
     """That of a camera whose place (3,) was found."""
-    return Sight(f"towards a {camera_words(place)}, whose pixels they are", viewpoint=place)
+    return Sight(f"towards a {camera_words(place)}, whose pixels they are", viewpoint=place, pixels=True)
 
 
 def camera_words(place: np.ndarray) -> str:
@@ -137,7 +138,7 @@ def _signs(
     """A sign for each line, and what decided those that are anew."""
     same = np.ones(len(known))
     if sight is not None and sight.inward is None:
-        return seen_signs(unit, lines, viewpoint=sight.viewpoint, up=sight.up), sight.words
+        return seen_signs(unit, lines, viewpoint=sight.viewpoint, up=sight.up, surely=sight.pixels), sight.words
     if sight is None and known.any() and not anew[known].any():
         return same, "as the nearest given"
     if sight is None and repair:

@@ -5,8 +5,8 @@ speaks for a side, the more the larger the angle. Neighbors on a surface speak f
 side of a sheet, flat or bent, attract each other. Signs start from the clear points and follow the paths on which axes
 turn least, or start as the lines came; then smooth pieces, and bodies of them, turn over while that satisfies more. Of
 a single sensor it is not certain that it saw all: what is behind other points on its ray follows its neighbors alone.
-From above, clear angles decide whatever the neighbors say. Assumed: neighbors lie on the same sheet more often than
-not. Cost: n log n.
+From above, and from a camera whose pixels the points are, clear angles decide whatever the neighbors say. Assumed:
+neighbors lie on the same sheet more often than not. Cost: n log n.
 
 *What contradicts itself.* Of normals some of which are turned over, the field of `orientation` tells the sides, but for
 walls thinner than their noise. There the given signs help as far as they are turned in patches: how often neighbors of
@@ -64,21 +64,26 @@ class Couplings(NamedTuple):
 
 
 def seen_signs(
-    points: np.ndarray, lines: np.ndarray, *, viewpoint: np.ndarray | None = None, up: np.ndarray | None = None
+    points: np.ndarray,
+    lines: np.ndarray,
+    *,
+    viewpoint: np.ndarray | None = None,
+    up: np.ndarray | None = None,
+    surely: bool = False,
 ) -> np.ndarray:
     """+1 or -1 for each unit line (n, 3) at points (n, 3): the side that was seen, (n,).
 
     viewpoint: place of the sensor, (3,), or of each point's own, (n, 3), NaN where it is not known. up: (3,), the
-    direction from which all was seen, as from the air. In a part of the cloud of which nothing is known, lines keep the
-    side of most of their neighbors.
+    direction from which all was seen, as from the air. surely: no point hides another from the sensor. In a part of the
+    cloud of which nothing is known, lines keep the side of most of their neighbors.
     """
     way = np.broadcast_to(np.asarray(up, np.float64), points.shape) if viewpoint is None else viewpoint - points
     with np.errstate(invalid="ignore"):
         way = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-300)
     seen = np.nan_to_num((lines * way).sum(1))
-    if viewpoint is not None and np.ndim(viewpoint) == 1:
+    if viewpoint is not None and np.ndim(viewpoint) == 1 and not surely:
         seen[_hidden(points, lines, np.asarray(viewpoint, np.float64))] = 0
-    return voted_signs(points, lines, seen, surely=viewpoint is None)
+    return voted_signs(points, lines, seen, surely=surely or viewpoint is None)
 
 
 def voted_signs(points: np.ndarray, lines: np.ndarray, seen: np.ndarray, *, surely: bool = False) -> np.ndarray:

@@ -24,6 +24,7 @@ class Sight(NamedTuple):
     viewpoint: np.ndarray | None = None  # place of the sensor, (3,), or of each point's own, (n, 3), NaN: not known
     up: np.ndarray | None = None  # (3,) direction from which all was seen
     inward: bool | None = None  # the side of closed shapes: true for rooms and tunnels
+    pixels: bool = False  # that of a camera whose pixels the points are, so that it saw all of them
 
 
 def sight_of(path: str | Path, attributes: Mapping[str, np.ndarray]) -> Sight | None:

@@ -11,6 +11,7 @@ from pnu.data.scanner import KINDS, Scanner
 from pnu.geometry.cloud_normals import FROM_ABOVE, ONE_SIDE, settled_normals, sight_by_places
 from pnu.geometry.mesh_sampling import sample_poisson_disk
 from pnu.geometry.single_view import camera_place, is_camera, seen_from_one_side, single_view
+from pnu.io.sensor import Sight
 
 Array = NDArray[np.float64]
 BALLS = np.array(
@@ -179,3 +180,15 @@ def test_normals_of_a_flat_thing_look_to_the_camera_that_saw_it() -> None:
     scan = KINDS["oneview"](Scanner(shapes.make("washer")), np.random.default_rng(4))
     points, true = scan.points[~scan.stray], scan.clean[~scan.stray, 3:]
     assert ((settled_normals(points, None).normals * true).sum(1) < 0).mean() < 0.01
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_what_a_camera_saw_looks_to_it_even_where_it_bends_away(told: bool) -> None:
+    for name, seed in (("impeller", 2), ("caltrop", 3), ("nut", 5)):
+        scan = KINDS["oneview"](Scanner(shapes.make(name)), np.random.default_rng(seed))
+        points, sensor = scan.points[~scan.stray], scan.sensor[0]
+        sight = Sight("told", viewpoint=sensor) if told else None
+        normals = settled_normals(points, None, asked=sight).normals
+        way = sensor - points
+        cosine = (normals * way).sum(1) / np.linalg.norm(way, axis=1)
+        assert (cosine < -0.5).sum() == 0
