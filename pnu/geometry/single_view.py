@@ -35,13 +35,11 @@ SAME, SQUARE = 1.1, 1.35  # angles to the second and the fourth neighbor, over t
 PAIRS, FOURS = 0.85, 0.7  # and the shares of the points that have them
 STEEP, FLAT = 0.95, 0.25  # of land: cosine of the way it was seen with z; height over its extent
 GLANCE = 512, 80  # points and directions of a first look for a camera somewhere,
-HIDDEN, CLOSE = (
-    0.06,
-    0.03,
-)  # share of points behind others above which there is none; more than the least in a way tried
-TRIED, STARTS = 20, 3  # ways that are tried, both of their ends, and those of them the search starts from
+HIDDEN = 0.075  # share of points behind others above which there is none
+CLOSE = 0.03  # so much more than the least may be behind others in ways that are tried
+TRIED, STARTS = 20, 2  # ways that are tried, both of their ends, and those of them the search starts from
 AWAY, STEP = 2.8, 0.35  # radii to a camera at first, and by which the search begins to move it
-WATCHED = 256  # points whose neighbors' angles are compared,
+WATCHED, NEARBY = 256, 24  # points whose angles to those nearby are compared,
 WIDEST = 0.5  # logarithm by which one counts at most
 UNLIKELY, UNEVEN = 0.21, 0.07  # mean logarithm by which they differ, above which a way, or a place, is none to a camera
 
@@ -96,7 +94,7 @@ def camera_place(points: Floats) -> Floats | None:
     return _camera_of(np.ascontiguousarray(points[np.lexsort(points.T)], np.float64).tobytes())
 
 
-@lru_cache(maxsize=4)  # several stages ask for that of the same points
+@lru_cache(maxsize=2)  # several stages ask for that of the same points
 def _camera_of(data: bytes) -> Floats | None:
     points = np.frombuffer(data).reshape(-1, 3)
     middle = points.mean(0)
@@ -114,15 +112,14 @@ def _camera_of(data: bytes) -> Floats | None:
     if len(ways) > TRIED:
         ways = ways[farthest_points_large(ways, TRIED)]
     starts = AWAY * np.concatenate([ways, -ways])
-    block = unit if len(unit) <= MOST else unit[np.argpartition((unit**2).sum(1), MOST)[:MOST]]
-    watched = np.linspace(0, len(block) - 1, min(WATCHED, len(block))).astype(int)
+    watched = unit[np.linspace(0, len(unit) - 1, min(WATCHED, len(unit))).astype(int)]
+    nearby = unit[PointTree(unit).nearest(watched, NEARBY, threads=thread_count())[1]]
 
     def unevenness(place: Floats) -> float:
         """Mean absolute logarithm of angles to the second and third neighbor over the usual one."""
-        rays = block - place
-        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-300)
-        angles = PointTree(rays).nearest(rays[watched], 4)[0][:, 2:]
-        logarithms = np.log(np.maximum(angles, 1e-12))
+        rays, around = _directions(watched - place), _directions(nearby - place)
+        angles = np.linalg.norm(around - rays[:, None], axis=2)
+        logarithms = np.log(np.maximum(np.partition(angles, (2, 3), axis=1)[:, 2:4], 1e-12))
         return float(np.minimum(np.abs(logarithms - np.median(logarithms)), WIDEST).mean())
 
     first = np.array([unevenness(start) for start in starts])
@@ -138,6 +135,10 @@ def _camera_of(data: bytes) -> Floats | None:
             away = float(np.linalg.norm(found.x))
             return middle + radius * found.x if NEAREST < away < FARTHEST else None
     return None
+
+
+def _directions(ways: Floats) -> Floats:
+    return np.asarray(ways / np.maximum(np.linalg.norm(ways, axis=-1, keepdims=True), 1e-300))
 
 
 class OneSide(NamedTuple):
