@@ -37,9 +37,9 @@ STEEP, FLAT = 0.95, 0.25  # of land: cosine of the way it was seen with z; heigh
 GLANCE = 512, 80  # points and directions of a first look for a camera somewhere,
 HIDDEN = 0.075  # share of points behind others above which there is none
 CLOSE = 0.03  # so much more than the least may be behind others in ways that are tried
-TRIED, STARTS = 20, 2  # ways that are tried, both of their ends, and those of them the search starts from
+TRIED, STARTS = 20, 3  # ways that are tried, both of their ends, and those of them the search starts from
 AWAY, STEP = 2.8, 0.35  # radii to a camera at first, and by which the search begins to move it
-WATCHED, NEARBY = 256, 24  # points whose angles to those nearby are compared,
+WATCHED = 256  # points whose neighbors' angles are compared,
 WIDEST = 0.5  # logarithm by which one counts at most
 UNLIKELY, UNEVEN = 0.21, 0.07  # mean logarithm by which they differ, above which a way, or a place, is none to a camera
 
@@ -112,14 +112,14 @@ def _camera_of(data: bytes) -> Floats | None:
     if len(ways) > TRIED:
         ways = ways[farthest_points_large(ways, TRIED)]
     starts = AWAY * np.concatenate([ways, -ways])
-    watched = unit[np.linspace(0, len(unit) - 1, min(WATCHED, len(unit))).astype(int)]
-    nearby = unit[PointTree(unit).nearest(watched, NEARBY, threads=thread_count())[1]]
+    block = unit if len(unit) <= MOST else unit[np.argpartition((unit**2).sum(1), MOST)[:MOST]]
 
-    def unevenness(place: Floats) -> float:
-        """Mean absolute logarithm of angles to the second and third neighbor over the usual one."""
-        rays, around = _directions(watched - place), _directions(nearby - place)
-        angles = np.linalg.norm(around - rays[:, None], axis=2)
-        logarithms = np.log(np.maximum(np.partition(angles, (2, 3), axis=1)[:, 2:4], 1e-12))
+    def unevenness(place: Floats, points: Floats = block) -> float:
+        """Mean absolute logarithm of angles to the second and third neighbor over the usual one, at some points."""
+        rays = points - place
+        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-300)
+        watched = np.linspace(0, len(points) - 1, min(WATCHED, len(points))).astype(int)
+        logarithms = np.log(np.maximum(PointTree(rays).nearest(rays[watched], 4)[0][:, 2:], 1e-12))
         return float(np.minimum(np.abs(logarithms - np.median(logarithms)), WIDEST).mean())
 
     first = np.array([unevenness(start) for start in starts])
@@ -131,14 +131,10 @@ def _camera_of(data: bytes) -> Floats | None:
         simplex = start + STEP * np.vstack([np.zeros(3), np.eye(3)])
         options = {"initial_simplex": simplex, "maxfev": 150, "xatol": 1e-3, "fatol": 1e-3}
         found = minimize(unevenness, start, method="Nelder-Mead", options=options)
-        if found.fun < UNEVEN:
+        if found.fun < UNEVEN and unevenness(found.x, unit) < UNEVEN:  # of the block, and of all
             away = float(np.linalg.norm(found.x))
             return middle + radius * found.x if NEAREST < away < FARTHEST else None
     return None
-
-
-def _directions(ways: Floats) -> Floats:
-    return np.asarray(ways / np.maximum(np.linalg.norm(ways, axis=-1, keepdims=True), 1e-300))
 
 
 class OneSide(NamedTuple):
