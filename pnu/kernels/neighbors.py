@@ -19,7 +19,7 @@ MORE = 3.0  # / sqrt(k): by that share more than the squared radius in which the
 ROOM = 8  # times k, at most, are collected before those too far are dropped
 TOGETHER = 8  # queries that share what lies around them,
 SPREAD = 20.0  # if none is farther from their middle, squared, than so many squared radii of the last one,
-CROWD = 1024  # and if there are no more points
+CROWD = 512  # and if there are fewer points
 ROUNDS = 40  # of narrowing down which points are the k nearest
 TINY = 1e-280  # squared radii below which rounding is no longer small
 ROUNDING = 1e-9  # of distances, far more than there is
@@ -39,8 +39,8 @@ class NeighborTree:
         axes, ids = np.full((3, leaves * LEAF), NOWHERE), np.zeros(leaves * LEAF, np.int64)
         boxes = np.empty((levels[-1], 6, CHILDREN))
         boxes[:, :3], boxes[:, 3:] = NOWHERE, -NOWHERE
-        self.parts = axes, ids, boxes, np.array(levels, np.int64)
-        _fill_tree(places, self.order, *self.parts)
+        self.parts = places, axes, ids, boxes, np.array(levels, np.int64)
+        _fill_tree(places, self.order, *self.parts[1:])
 
     def search(self, queries: NDArray[np.floating], k: int) -> tuple[Ints, Floats]:
         """The k <= n nearest points of each query (m, 3): `idx[i, j]` is the j-th nearest of query i, and their squared
@@ -269,44 +269,6 @@ def _within(
 
 
 @kernel(exact=True, inner=True)
-def _around(
-    middle: Floats, limit: float, axes: Floats, ids: Ints, boxes: Floats, levels: Ints,
-    far: Floats, stack: Ints, dist: Floats, crowd: Floats, crowd_ids: Ints,
-) -> int:  # fmt: skip
-    """All points within a squared radius, in any order: crowd (3, room), crowd_ids (room,). -1: there is no room."""
-    x, y, z = middle
-    count, depth = 0, 1
-    stack[0, 0], stack[0, 1] = len(levels) - 2, 0
-    while depth:
-        depth -= 1
-        level, group = stack[depth]
-        _to_boxes(x, y, z, boxes[levels[level] + group], far)
-        for child in range(CHILDREN):
-            if far[child] > limit:
-                continue
-            below = group * CHILDREN + child
-            if level:
-                stack[depth, 0], stack[depth, 1] = level - 1, below
-                depth += 1
-                continue
-            if count + LEAF > len(crowd_ids):
-                return -1
-            first = below * LEAF
-            for i in range(LEAF):
-                dx, dy, dz = axes[0, first + i] - x, axes[1, first + i] - y, axes[2, first + i] - z
-                dist[i] = dx * dx + dy * dy + dz * dz
-            for i in range(LEAF):
-                crowd_ids[count] = first + i
-                count += dist[i] <= limit
-    for i in range(count):
-        place = crowd_ids[i]
-        for axis in range(3):
-            crowd[axis, i] = axes[axis, place]
-        crowd_ids[i] = ids[place]
-    return count
-
-
-@kernel(exact=True, inner=True)
 def _middle(queries: Floats, first: int, stop: int, middle: Floats) -> float:
     """The mean of some queries -> middle (3,), and the largest squared distance of one from it."""
     widest = 0.0
@@ -322,23 +284,24 @@ def _middle(queries: Floats, first: int, stop: int, middle: Floats) -> float:
 
 
 @kernel(
-    "void(float64[:, ::1], int64, float64[:, ::1], int64[::1], float64[:, :, ::1], int64[::1], int64[:, ::1],"
-    " float64[:, ::1])",
+    "void(float64[:, ::1], int64, float64[:, ::1], float64[:, ::1], int64[::1], float64[:, :, ::1], int64[::1],"
+    " int64[:, ::1], float64[:, ::1])",
     exact=True,
 )
 def _search(
-    queries: Floats, k: int, axes: Floats, ids: Ints, boxes: Floats, levels: Ints, idx: Ints, dist_sq: Floats
-) -> None:
+    queries: Floats, k: int, points: Floats, axes: Floats, ids: Ints, boxes: Floats, levels: Ints,
+    idx: Ints, dist_sq: Floats,
+) -> None:  # fmt: skip
     """See `NeighborTree.search`."""
     n = len(ids)
     while n and axes[0, n - 1] == NOWHERE:
         n -= 1
-    room = max(ROOM * k + 4 * LEAF * CHILDREN, CROWD)
+    room = max(ROOM * k + 4 * LEAF * CHILDREN, 2 * CROWD)
     dist, found, ranks = np.empty(room), np.empty(room, np.int64), np.empty(room, np.int64)
     nearby = np.empty(max(room, CHILDREN * k + LEAF * CHILDREN))
     nearby_ids = np.empty(len(nearby), np.int64)
     far, stack = np.empty(CHILDREN), np.empty((24 * CHILDREN, 2), np.int64)
-    crowd, crowd_ids, middle = np.empty((3, CROWD)), np.empty(CROWD, np.int64), np.empty(3)
+    crowd, crowd_ids, middle = np.empty((3, CROWD)), np.empty(2 * CROWD, np.int64), np.empty(3)
     limit, grow, around, reach = -1.0, 1 + MORE / np.sqrt(k), 0, 0.0
     for q in range(len(queries)):
         x, y, z = queries[q]
@@ -346,7 +309,26 @@ def _search(
             widest, around = _middle(queries, q, min(q + TOGETHER, len(queries)), middle), 0
             if limit > TINY and widest < SPREAD * limit:
                 reach = np.sqrt(widest) + np.sqrt(limit * grow)
-                around = _around(middle, reach * reach, axes, ids, boxes, levels, far, stack, dist, crowd, crowd_ids)
+                around = _within(
+                    middle[0],
+                    middle[1],
+                    middle[2],
+                    reach * reach,
+                    CROWD,
+                    axes,
+                    ids,
+                    boxes,
+                    levels,
+                    far,
+                    stack,
+                    dist,
+                    crowd_ids,
+                )
+                if around >= CROWD:  # some may have been dropped
+                    around = 0
+                for i in range(around):
+                    for axis in range(3):
+                        crowd[axis, i] = points[crowd_ids[i], axis]
         if around >= k:
             for i in range(around):
                 dx, dy, dz = crowd[0, i] - x, crowd[1, i] - y, crowd[2, i] - z
