@@ -13,6 +13,7 @@ from pnu.geometry.single_view import camera_place
 from pnu.geometry.spacing import spacing
 from pnu.io import Cloud
 from pnu.io.cloud import chosen
+from pnu.io.sensor import Sight
 
 Treatment = Literal["auto", "keep"]
 TREATMENTS = ("auto", "keep")
@@ -33,6 +34,11 @@ class Cleaned(NamedTuple):
     character: Character = "clean"  # of a cloud without normals; what has them is "clean"
     estimated: NDArray[np.float64] | None = None  # normals (n, 3) of the cloud, where they had to be known to tell
     camera: NDArray[np.float64] | None = None  # place (3,) from which all of a cloud without normals was seen
+
+    @property
+    def sight(self) -> Sight | None:
+        """That of the camera, where there is one."""
+        return None if self.camera is None else camera_sight(self.camera)
 
 
 def clean_cloud(
@@ -82,8 +88,7 @@ def clean_cloud(
         return scanned._replace(character="scanned")
     if not is_noisy(cloud.points):  # nor has it thin walls, whose sides normals tell apart
         return scanned
-    sight = None if camera is None else camera_sight(camera)
-    estimated = settled_normals(cloud.points, None, found=sight).normals
+    estimated = settled_normals(cloud.points, None, found=found.sight).normals
     if is_noisy(cloud.points, estimated):
         return found._replace(character=noisy_character(cloud.points), estimated=estimated)
     return scanned._replace(estimated=estimated)

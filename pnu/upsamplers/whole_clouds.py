@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, get_args, ov
 import numpy as np
 
 from pnu import __version__
-from pnu.cleaning import Character, Treatment, clean_cloud
+from pnu.cleaning import Character, Cleaned, Treatment, clean_cloud
 from pnu.geometry.attributes import carry
-from pnu.geometry.cloud_normals import camera_sight, check_not_a_line, settled_normals
+from pnu.geometry.cloud_normals import check_not_a_line, settled_normals
 from pnu.geometry.normal_estimation import complete_normals
 from pnu.geometry.point_tree import PointTree
 from pnu.geometry.unit_sphere import Frame, unit_sphere_frame
@@ -204,17 +204,16 @@ def upsample(
         raise ValueError(f"merge={merge}: expected {' or '.join(get_args(Merge))}")
     if keep not in (True, False, "auto"):
         raise ValueError(f"keep={keep}: expected true, false or auto")
-    given, _, character, estimated, camera = clean_cloud(
-        given, outliers=outliers, lines="keep" if keep is True else lines, signs=signs
-    )
-    network, target = on_device(*_model(model, given.normals, character, device), device)
+    cleaned = clean_cloud(given, outliers=outliers, lines="keep" if keep is True else lines, signs=signs)
+    given = cleaned.cloud
+    network, target = on_device(*_model(model, given.normals, cleaned.character, device), device)
     upsampler = upsampler_of(network, patch_size)
     if devices > 1 and not getattr(upsampler, "parallel", False):
         raise ValueError(f"devices={devices}: {type(network).__name__} works in one process; leave devices=1")
     if merge == "agreed" and not getattr(upsampler, "merges", False):
         raise ValueError(f"merge=agreed: {type(network).__name__} has no patches that overlap; leave it out")
     names = _names(target, devices)
-    sparse, frame = _prepare(given, progress, estimated, camera, refine=not getattr(network, "passes", 0))
+    sparse, frame = _prepare(cleaned, progress, refine=not getattr(network, "passes", 0))
     if not getattr(upsampler, "follows", False) and (density == "follow" or keep is True):
         asked = "density=follow" if density == "follow" else "keep=true"
         raise ValueError(
@@ -487,19 +486,12 @@ def _digest(network: Any, sparse: np.ndarray, count: int, upsampler: object, *op
     return digest.hexdigest()[:16]
 
 
-def _prepare(
-    cloud: Cloud,
-    progress: Progress,
-    estimated: np.ndarray | None = None,
-    camera: np.ndarray | None = None,
-    *,
-    refine: bool = False,
-) -> tuple[np.ndarray, Frame]:
+def _prepare(cleaned: Cleaned, progress: Progress, *, refine: bool = False) -> tuple[np.ndarray, Frame]:
     """The points in a fixed order with normals, (n, 6) float64 in the unit sphere, and the way back.
 
-    estimated: normals (n, 3), known already, that a cloud without any gets; or camera: the place (3,) that saw it all.
-    refine: those that are missing are found by the surface model, not left to a network that does so itself.
+    refine: normals that are missing are found by the surface model, not left to a network that does so itself.
     """
+    cloud = cleaned.cloud
     order = np.lexsort(cloud.points.T)
     unit, frame = _unit_sphere(cloud.points[order])
     given = None if cloud.normals is None else cloud.normals[order]
@@ -507,9 +499,9 @@ def _prepare(
     if missing.any():
         progress("normals", 0, 1)
         if given is None:
+            estimated = cleaned.estimated
             if estimated is None:
-                sight = None if camera is None else camera_sight(camera)
-                estimated = settled_normals(cloud.points, None, found=sight).normals
+                estimated = settled_normals(cloud.points, None, found=cleaned.sight).normals
             directions = estimated[order]
         else:
             directions = complete_normals(unit, given)
