@@ -365,7 +365,8 @@ class Pictures(pl.Callback):
                     )
             picture = self.picture(sample, prediction.numpy())
             if picture is not None:
-                save_png(self.folder / f"{sample['shape']}_{self.drawn:07d}.png", picture)
+                name = sample["shape"].replace("/", "_")  # a shape of a folder, or "procedural/apple"
+                save_png(self.folder / f"{name}_{self.drawn:07d}.png", picture)
                 if writer is not None:
                     writer.add_image(sample["shape"], picture, self.drawn, dataformats="HWC")
         module.train(training)

@@ -7,6 +7,7 @@ import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import h5py
@@ -255,6 +256,17 @@ def test_pictures_show_the_first_and_the_last_validation(finished: Path) -> None
     paths = sorted((finished / "pictures").iterdir())
     assert [path.stem.rpartition("_")[2] for path in paths] == ["0000000", "0000008"]
     assert all(np.asarray(Image.open(path)).std() > 0 for path in paths)
+
+
+def test_pictures_of_shapes_named_by_folders(tmp_path: Path) -> None:
+    drawn = callbacks.Pictures(SimpleNamespace(pictures=tmp_path), size=32)  # type: ignore[arg-type]
+    cloud = torch.randn(64, 6, generator=torch.Generator().manual_seed(0))
+    drawn.samples = [{"shape": "procedural/apple", "input": cloud, "target": cloud}]
+    trainer = SimpleNamespace(is_global_zero=True, global_step=7, loggers=[])
+    network = torch.nn.Identity()
+    network.device = torch.device("cpu")  # type: ignore[assignment]
+    drawn.draw(trainer, network)  # type: ignore[arg-type]
+    assert [path.name for path in tmp_path.iterdir()] == ["procedural_apple_0000007.png"]
 
 
 def test_the_end_tells_what_came_out_and_how_to_go_on(train: Train, capsys: pytest.CaptureFixture[str]) -> None:
