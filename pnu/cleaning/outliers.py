@@ -1,7 +1,9 @@
 """Stray points: those that measure nothing, found by small trained networks and taken out.
 
-One network looks at how a point lies among its neighbors in space. Where one camera saw all points, another looks at
-how its depth fits to that of the pixels around it, which tells points torn off at edges from surfaces seen at a slant.
+One network looks at how a point lies among its neighbors in space. What it leaves doubtful a second one holds against
+the surface that all others sample, near and far: where a cloud thins out its last points are no strays. Where one
+camera saw all points, another looks at how the depth of each fits to that of the pixels around it, which tells points
+torn off at edges from surfaces seen at a slant.
 """
 
 from functools import cache
@@ -11,16 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnu.geometry.connected_parts import connected_parts
+from pnu.geometry.doubt_features import doubt_features
 from pnu.geometry.outlier_features import outlier_features
 from pnu.geometry.pixel_features import pixel_features
 from pnu.geometry.point_tree import PointTree
 from pnu.runtime.threads import thread_count
 
-WEIGHTS = Path(__file__).parent  # both trained by pnu.training.outlier_training
-SURE = 3.5  # logarithm of the odds from which on a point is taken for stray,
-TORN = 3.5  # in the picture of a camera,
-LIKELY = 1.7  # or this where there are many: a share of
-MANY = 0.0035  # of the points is sure; noise of 1 % of the radius stays below
+WEIGHTS = Path(__file__).parent  # all trained by pnu.training.outlier_training
+DOUBTFUL = -1.0  # logarithm of the odds from which on a point is looked at again, beside those that are not,
+SURE = 0.5  # and from which on it is then taken for stray,
+TORN = 3.5  # or in the picture of a camera
+MANY = 0.0035  # share of stray points from which on a cloud has many; noise of 1 % of the radius stays below
 ROUNDS = 3  # a stray point hides another,
 SINGLE = 3  # but so few of them none
 PIECE = 12  # points below which a piece that stands apart is stray,
@@ -28,22 +31,19 @@ SPECK = 4  # and in the picture of a camera, of whose edges it may be all that i
 APART = 6.0  # usual spacings between a piece and all others
 EVEN = 0.45  # breadth of the middle 80 % of nearest distances over their median, below which points keep a distance
 FITS = (0.6, 1.6)  # nearest distances over those around, of points that fit into such an order
-BESIDE = 1.3  # local spacings to the nearest point that stays, within which one continues its surface,
-LEVEL = 0.9  # and those to the plane there
-AROUND = 12  # points that such a plane goes through
 FEWEST = 64  # points of a cloud in which strays can be told
 
 
 @cache
 def detector_weights(name: str) -> dict[str, NDArray[np.float32]]:
-    """Those of a `pnu.networks.outlier_detector.OutlierDetector` that comes with pnu, "outliers" or "torn"."""
+    """Those of a `pnu.networks.outlier_detector.OutlierDetector` of pnu: "outliers", "doubtful" or "torn"."""
     from safetensors.numpy import load_file
 
     return load_file(WEIGHTS / f"{name}.safetensors")
 
 
 def stray_odds(features: NDArray[np.float32], name: str = "outliers") -> NDArray[np.float32]:
-    """Logarithm of the odds that each point is stray, (n,), of features (n, 52) or (n, 34), as a detector does."""
+    """Logarithm of the odds that each point is stray, (n,), of features as a detector wants them."""
     weights = detector_weights(name)
     values = (features - weights["mean"]) / weights["deviation"]
     for layer in (0, 2, 4):
@@ -69,42 +69,29 @@ def stray_points(points: NDArray[np.float64], camera: NDArray[np.float64] | None
 
 
 def _in_space(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which points (n, 3) stay, (n,): all but those that the detector finds and that neither fit in nor go on."""
-    stays, enough = np.ones(len(points), bool), SURE
+    """Which points (n, 3) stay, (n,)."""
+    stays = np.ones(len(points), bool)
     for _ in range(ROUNDS):
         rows = np.flatnonzero(stays)
         if len(rows) < FEWEST:
             break
-        odds = stray_odds(outlier_features(points[rows]))
-        if (odds > SURE).mean() > MANY:
-            enough = LIKELY
-        stray = odds > enough
+        stray = _settled_odds(points[rows]) > SURE
         if stray.any():
             stray &= ~fit_in_order(points[rows])
         stays[rows[stray]] = False
         if stray.sum() <= SINGLE:
             break
-    if stays.sum() >= FEWEST and not stays.all():
-        stays[~stays] = continue_surface(points[~stays], points[stays])
     return stays
 
 
-def continue_surface(points: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which points (m, 3) lie beside others (n, 3) and in the plane that those make there, (m,).
-
-    Where a cloud thins out the detector takes its last points for stray; they are none.
-    """
-    tree, count = PointTree(others), thread_count()
-    distance, near = tree.nearest(points, AROUND, threads=count)
-    some = near[:, : AROUND // 2]
-    spacing = tree.nearest(others[some].reshape(-1, 3), 7, threads=count)[0][:, 1:].reshape(*some.shape, 6).mean((1, 2))
-    around = others[near]
-    center = around.mean(1)
-    offsets = around - center[:, None]
-    normal = np.linalg.eigh(offsets.swapaxes(1, 2) @ offsets)[1][:, :, 0]
-    rise = np.abs(((points - center) * normal).sum(1))
-    fits: NDArray[np.bool_] = (distance[:, 0] < BESIDE * spacing) & (rise < LEVEL * spacing)
-    return fits
+def _settled_odds(points: NDArray[np.float64]) -> NDArray[np.float32]:
+    """As `stray_odds`, (n,), of points (n, 3) at a first look, and of the doubtful ones at a second."""
+    odds = stray_odds(outlier_features(points))
+    doubtful = odds > DOUBTFUL
+    if doubtful.any() and (~doubtful).sum() >= FEWEST:
+        features = doubt_features(points[doubtful], points[~doubtful], odds[doubtful])
+        odds[doubtful] = stray_odds(features, "doubtful")
+    return odds
 
 
 def fit_in_order(points: NDArray[np.float64]) -> NDArray[np.bool_]:
