@@ -8,6 +8,7 @@ from pnu.commands._entry import command
 from pnu.config.instantiate import PACKAGES, find_metric, instantiate
 from pnu.config.schema import Group, Groups, doc
 from pnu.extras import needed
+from pnu.runtime import denormals
 from pnu.runtime.provenance import machine
 
 
@@ -101,13 +102,14 @@ def train(cfg: Any) -> list[float] | None:
             "machine": machine(),
         }
         start = run.last if run.last.exists() else None
-        if start is None:
-            run.add_metrics("start" if source else "untrained", trainer.validate(module, data, verbose=False))
-        trainer.fit(module, data, ckpt_path=start, weights_only=True)
-        if run.best.exists():
-            module.load_state_dict(checkpoints.read_checkpoint(run.best)["state_dict"])
-        if not run.pruned:
-            run.add_metrics("test", trainer.test(module, data, verbose=False))
+        with denormals.as_zero():
+            if start is None:
+                run.add_metrics("start" if source else "untrained", trainer.validate(module, data, verbose=False))
+            trainer.fit(module, data, ckpt_path=start, weights_only=True)
+            if run.best.exists():
+                module.load_state_dict(checkpoints.read_checkpoint(run.best)["state_dict"])
+            if not run.pruned:
+                run.add_metrics("test", trainer.test(module, data, verbose=False))
         result = objective(config, run)
     if is_main_process():
         print(run if config["quiet"] else job_line(run) if "job" in run.facts else closing_lines(run))

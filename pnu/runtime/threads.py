@@ -11,6 +11,8 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import Any, TypeVar
 
+from pnu.runtime import denormals
+
 Part = TypeVar("Part")
 Result = TypeVar("Result")
 
@@ -45,8 +47,11 @@ def map_on_threads(work: Callable[[Part], Result], parts: Sequence[Part]) -> lis
             return [work(part) for part in parts]
         return list(_pool(threads, os.getpid(), False).map(work, parts))
 
+    zero = denormals.are_zero()
+
     def quiet(part: Part) -> Result:
-        with torch.no_grad():  # the mode is each thread's own
+        torch.set_flush_denormal(zero)
+        with torch.no_grad():  # both modes are each thread's own
             return work(part)
 
     if threads == 1:

@@ -16,6 +16,7 @@ import numpy as np
 from pnu.cleaning import Character
 from pnu.networks import checkpoints
 from pnu.networks.compiled_surface import CompiledSurface, read_compiled
+from pnu.runtime import denormals
 from pnu.runtime.threads import torch_if_loaded
 from pnu.upsamplers.selection import CLASSICAL, classical
 
@@ -95,7 +96,7 @@ def inferring(model: object) -> Iterator[None]:
 
     from pnu.fast import accelerated
 
-    with torch.no_grad(), evaluating(model), accelerated(modules_of(model)), ExitStack() as stack:
+    with torch.no_grad(), denormals.as_zero(), evaluating(model), accelerated(modules_of(model)), ExitStack() as stack:
         if torch.get_default_device().type != "cpu":
             stack.enter_context(torch.device("cpu"))
         yield

@@ -22,7 +22,8 @@ SMALLEST_PATCH = 64  # points that every network accepts; a smaller cloud is rep
 SLACK = 1.1  # growth beyond the network's ratio for which overlapping patches have points enough
 KEPT = 256  # patches whose predictions are kept in one file
 TURNS = 2  # orientations of a patch where predictions are to agree
-BATCHES = 32  # on a CPU, that its threads share
+AT_ONCE = 1024  # points that go through a network together on a CPU, by one thread
+BATCHES = 32  # of these, that its threads share
 
 
 class Patches:
@@ -95,7 +96,8 @@ class Patches:
         if size < SMALLEST_PATCH:
             idx = idx[:, torch.arange(SMALLEST_PATCH) % size]
         like = example(self.network)
-        together = patches_at_once(like, context.batch_size) * (BATCHES if like.device.type == "cpu" else 1)
+        at_once = patches_at_once(like, context.batch_size, idx.shape[1])
+        together = at_once * (BATCHES if like.device.type == "cpu" else 1)
 
         places, rows = cloud.numpy(), idx.numpy()
 
@@ -133,7 +135,7 @@ def predictions(network: nn.Module, places: np.ndarray, batch_size: int | None =
     digit of a matrix product, which may decide between two farthest points, depends on nothing else.
     """
     like, cloud = example(network), torch.from_numpy(places)
-    on_cpu, size = like.device.type == "cpu", patches_at_once(like, batch_size)
+    on_cpu = like.device.type == "cpu"
 
     def predict(idx: Tensor) -> Tensor:
         patch = cloud[idx]
@@ -148,7 +150,7 @@ def predictions(network: nn.Module, places: np.ndarray, batch_size: int | None =
         return made
 
     def work(rows: np.ndarray) -> np.ndarray:
-        batches = torch.split(torch.from_numpy(rows), size)
+        batches = torch.split(torch.from_numpy(rows), patches_at_once(like, batch_size, rows.shape[1]))
         found = threads.map_on_threads(predict, batches) if on_cpu else [predict(batch) for batch in batches]
         return torch.cat(found).numpy()
 
@@ -174,6 +176,6 @@ def example(network: nn.Module) -> Tensor:
     return next(network.parameters(), torch.empty(0))
 
 
-def patches_at_once(like: Tensor, batch_size: int | None) -> int:
-    """Patches that go through the network together."""
-    return 1 if like.device.type == "cpu" else batch_size or 64
+def patches_at_once(like: Tensor, batch_size: int | None, size: int) -> int:
+    """Patches of `size` points that go through the network together."""
+    return max(1, AT_ONCE // size) if like.device.type == "cpu" else batch_size or 64

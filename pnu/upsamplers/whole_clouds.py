@@ -158,8 +158,8 @@ def upsample(
         device: "auto" (where the given network is; else CUDA where there is one), "cpu", "cuda", "cuda:1" ...
         devices: CUDA devices, or processes on the CPU, that share the work of the network; the result is the same for
             any number. More than one needs `if __name__ == "__main__":` in a script.
-        batch_size: patches at once on a GPU, by default 64; on the CPU each thread takes one. Of "surface": points at
-            once, by default 65536 on a GPU and 512 a thread on the CPU.
+        batch_size: patches at once on a GPU, by default 64; on the CPU each thread takes as many as have 1024 points.
+            Of "surface": points at once, by default 65536 on a GPU and 512 a thread on the CPU.
         seed: of models that draw random numbers; the paper's procedure draws none.
         progress: called as progress(stage, done, total).
         parts: folder for finished parts of a long computation; the same call goes on from them after an interruption.

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from pnu.networks.pnu import PNU
 from pnu.upsamplers import Context, Patches
+from pnu.upsamplers.patches import predictions
 from pnu.upsamplers.whole_clouds import normals, upsample
 
 Array = np.ndarray
@@ -145,6 +146,14 @@ def test_batch_size_and_threads_do_not_matter(network: PNU) -> None:
     finally:
         torch.set_num_threads(before)
     np.testing.assert_allclose(one, several, atol=1e-5)
+
+
+def test_patches_together_are_as_patches_alone(network: PNU, monkeypatch: pytest.MonkeyPatch) -> None:
+    cloud = np.hstack([sphere(700), sphere(700)])
+    rows = np.random.default_rng(0).integers(700, size=(20, 64))
+    together = predictions(network, cloud)(rows)
+    monkeypatch.setattr("pnu.upsamplers.patches.AT_ONCE", 64)
+    np.testing.assert_allclose(predictions(network, cloud)(rows), together, atol=1e-5)
 
 
 def test_order_and_repetition_do_not_matter(network: PNU) -> None:

@@ -36,6 +36,21 @@ def test_exported_weights_are_those_of_the_run(place: Path, capsys: pytest.Captu
     assert sorted(path.name for path in place.iterdir()) == ["run", "small.safetensors"]
 
 
+def test_tiny_weights_are_written_as_zero_and_others_as_they_are(tmp_path: Path) -> None:
+    state = {"some": torch.tensor([1e-39, -1e-21, 1e-19, -2.0, float("nan")]), "count": torch.tensor(3)}
+    weights.write(tmp_path / "a.safetensors", MODEL, state)
+    read = weights.read(tmp_path / "a.safetensors").state
+    assert torch.equal(read["some"][:4], torch.tensor([0.0, 0.0, 1e-19, -2.0]))
+    assert read["some"][4].isnan()
+    assert read["count"] == 3
+
+
+@pytest.mark.parametrize("name", weights.shipped_names())
+def test_no_weights_that_ship_are_tiny(name: str) -> None:
+    for values in weights.read(weights.FOLDER / f"{name}.safetensors").state.values():
+        assert not ((values != 0) & (values.abs() < weights.TINY)).any()
+
+
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
