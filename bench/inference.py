@@ -15,27 +15,29 @@ from bench.plain import PlainPNU
 from bench.scale import wavy_sphere
 from bench.timing import Row, compare
 from pnu.io import write_cloud, write_json
+from pnu.networks.checkpoints import load
 from pnu.networks.pnu import PNU
 from pnu.networks.released import from_released
 from pnu.upsamplers.whole_clouds import upsample
 
 POINTS, RATIO, PATCH = 5000, 4, 1024
+SHIPS = 64  # points of the patches of the weights that ship
 SHARED = 10_000  # points of a cloud that processes share
 
 
 @torch.no_grad()
-def naive(network: torch.nn.Module, cloud: Tensor) -> Tensor:
+def naive(network: torch.nn.Module, cloud: Tensor, size: int = PATCH) -> Tensor:
     """The paper's section Inference word by word: full matrices, one patch after the other. cloud (n, 6)."""
     points = cloud[:, :3]
-    count = round(RATIO * len(cloud) / PATCH)
+    count = round(RATIO * len(cloud) / size)
     centers = plain_farthest_points(points[None], count)[0]
-    idx = full_matrix(points[None, centers], points[None])[0].topk(PATCH, largest=False).indices
+    idx = full_matrix(points[None, centers], points[None])[0].topk(size, largest=False).indices
     predicted = []
     for patch in cloud[idx]:
         middle = patch[:, :3].mean(0)
-        size = (patch[:, :3] - middle).norm(dim=1).max()
-        dense = network(torch.cat([(patch[:, :3] - middle) / size, patch[:, 3:]], 1)[None])[0]
-        predicted.append(torch.cat([dense[:, :3] * size + middle, dense[:, 3:]], 1))
+        radius = (patch[:, :3] - middle).norm(dim=1).max()
+        dense = network(torch.cat([(patch[:, :3] - middle) / radius, patch[:, 3:]], 1)[None])[0]
+        predicted.append(torch.cat([dense[:, :3] * radius + middle, dense[:, 3:]], 1))
     everything = torch.cat(predicted)
     return everything[plain_loop(everything[:, :3], RATIO * len(cloud))]
 
@@ -81,6 +83,15 @@ def rows() -> Iterator[Row]:
     ).seconds
     for name, title in (("pnu", "network pnu"), ("surface", "surface")):
         yield Row(f"upsample {size}, {title}, warm", {"pnu": turns[name], theirs: turns[theirs]})
+    ships = load("pnu")
+    yield compare(
+        f"upsample {size}, pnu as it ships, patches of {SHIPS}, warm",
+        {
+            "pnu": partial(upsample, points, normals, model=ships),
+            theirs: partial(naive, ships, tensor, SHIPS),
+        },
+        rounds=2,
+    )
     large = wavy_sphere(SHARED)
     share = partial(upsample, large[:, :3], large[:, 3:], model="surface", device="cpu")
     yield compare(

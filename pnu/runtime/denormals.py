@@ -1,7 +1,7 @@
 """Numbers below 1e-38, which are stored without a leading one, taken for zero.
 
 Weights that a training leaves behind shrink to such numbers, and processors of Intel take some hundred times as long
-for each product of them: a step of such a network takes ten times as long, and what comes out is the same.
+for each product of them: a step of such a network takes up to ten times as long, and what comes out is the same.
 """
 
 from collections.abc import Iterator
