@@ -8,7 +8,6 @@ from pnu.commands._entry import command
 from pnu.config.instantiate import PACKAGES, find_metric, instantiate
 from pnu.config.schema import Group, Groups, doc
 from pnu.extras import needed
-from pnu.runtime import denormals
 from pnu.runtime.provenance import machine
 
 
@@ -60,6 +59,7 @@ def train(cfg: Any) -> list[float] | None:
 
         from pnu import metrics, networks
         from pnu.networks import checkpoints
+        from pnu.runtime import denormals
         from pnu.training import callbacks, lightning_module, sweeps
 
         lightning_module.quieten()
