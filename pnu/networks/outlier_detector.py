@@ -1,6 +1,6 @@
-"""The network that finds stray points, from how each lies among its neighbors: in space, or in a camera's picture.
+"""The network that finds stray points, from how each lies among its neighbors, in space or in a camera's picture.
 
-Their features are those of `pnu.geometry.outlier_features` and `pnu.geometry.pixel_features`.
+Their features are those of `outlier_features`, `doubt_features` and `pixel_features` in `pnu.geometry`.
 """
 
 import torch

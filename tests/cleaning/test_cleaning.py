@@ -14,11 +14,12 @@ from pnu.commands.upsample import main
 from pnu.data import shapes
 from pnu.data.scanner import KINDS, DepthCamera, Scanner, random_turn
 from pnu.geometry.anisotropy import averaged, evenness, thinned_lines
+from pnu.geometry.doubt_features import DOUBT_FEATURES
 from pnu.geometry.mesh_sampling import sample_area
 from pnu.geometry.outlier_features import FEATURES, NEIGHBORS, outlier_features
 from pnu.geometry.sphere_directions import sphere_directions
 from pnu.io import Cloud, read_cloud
-from pnu.training.outlier_training import examples_of_pictures, train_detector
+from pnu.training.outlier_training import examples_of_doubt, examples_of_pictures, train_detector
 from pnu.upsamplers.inference import weights_source
 
 
@@ -256,6 +257,16 @@ def test_torn_points_of_a_depth_camera_go_and_slanted_walls_stay(name: str, in_p
     assert torn > 100
     assert left < most * torn
     assert lost < 0.1 * torn
+
+
+@pytest.mark.slow
+def test_the_network_for_doubtful_points_is_trained_in_moments_on_a_shape() -> None:
+    examples = examples_of_doubt([shapes.make("teddy")], 0)
+    assert examples.features.shape == (len(examples.stray), DOUBT_FEATURES)
+    network = train_detector(examples, steps=200)
+    odds = network(examples.features).detach()
+    stray = examples.stray.bool()
+    assert (odds[stray].median() > odds[~stray].quantile(0.95)).item()
 
 
 def test_the_network_for_pictures_is_trained_in_moments_on_a_shape() -> None:
