@@ -27,6 +27,7 @@ FELLOWS = (6, 24)  # which the point is held against
 AROUND = 12  # neighbors between which it may be seen from a side that is empty
 DOUBTFUL = 3  # other doubtful points, whose distances are told
 LIMIT = 6.0  # of all features
+TINY = 1e-100  # no length that something is divided by is less
 ROWS = 2**13  # points at once: bounds the memory
 OF_LEVEL = len(RANKS) + 6 * len(PLANES) + 3 * len(BENT) + 5 * len(FELLOWS) + 1
 DOUBT_FEATURES = len(SHARES) * (OF_LEVEL + 1) + DOUBTFUL
@@ -40,7 +41,10 @@ def doubt_features(points: Floats, others: Floats, odds: NDArray[np.float32]) ->
     odds: (m,), logarithms of those that each is stray, after a first look.
     """
     others = others[np.lexsort(others.T)]
-    middle = int(((others - others.mean(0)) ** 2).sum(1).argmin())  # to begin with, however the cloud is turned
+    center = others.mean(0)
+    radius = max(float(np.abs(others - center).max()), TINY)
+    points, others = (points - center) / radius, (others - center) / radius
+    middle = int((others**2).sum(1).argmin())  # to begin with, however the cloud is turned
     others = np.concatenate([others[middle : middle + 1], np.delete(others, middle, 0)])
     counts = [min(len(others), max(len(others) // share, LEAST)) for share in SHARES]
     order = farthest_points_large(others, counts[1])
@@ -55,7 +59,7 @@ def doubt_features(points: Floats, others: Floats, odds: NDArray[np.float32]) ->
     alike = min(DOUBTFUL, len(points) - 1)
     apart = PointTree(points).nearest(points, alike + 1, threads=thread_count())[0][:, 1:]
     found.append(np.full((len(points), DOUBTFUL), LIMIT))
-    found[-1][:, :alike] = np.log(np.maximum(apart, 1e-300) / unit[:, -1:])
+    found[-1][:, :alike] = np.log(np.maximum(apart, TINY) / unit[:, -1:])
     found.append(odds[:, None])
     features: NDArray[np.float32] = np.clip(np.nan_to_num(np.hstack(found)), -LIMIT, LIMIT).astype(np.float32)
     return features
@@ -75,7 +79,7 @@ class _Level(NamedTuple):
         """Distances and rows (m, k) of the nearest; of fewer points the farthest several times."""
         distance, near = self.tree.nearest(queries, min(k, len(self.points)), threads=thread_count())
         missing = ((0, 0), (0, k - near.shape[1]))
-        return np.maximum(np.pad(distance, missing, mode="edge"), 1e-300), np.pad(near, missing, mode="edge")
+        return np.maximum(np.pad(distance, missing, mode="edge"), TINY), np.pad(near, missing, mode="edge")
 
 
 class _Plane(NamedTuple):
@@ -101,8 +105,8 @@ def _beside(points: Floats, level: _Level) -> tuple[Floats, Floats]:
     apart, own = level.nearest(level.points[named], OWN + 1)
     planes = _Plane.of(level.points[own])
     normals = planes.axes[:, :, 0]
-    rough = planes.size[:, 0] / np.maximum(np.linalg.norm(planes.size, axis=1), 1e-300)
-    unit = np.median(apart[there, SPACED - 1], 1)
+    rough = planes.size[:, 0] / np.maximum(np.linalg.norm(planes.size, axis=1), TINY)
+    unit = np.median(apart[there, SPACED - 1], 1)  # above zero, as all distances are
     around = level.points[near]
     columns = [np.log(distance[:, RANKS - 1] / unit[:, None])]
     for k in PLANES:
@@ -125,7 +129,7 @@ def _beside(points: Floats, level: _Level) -> tuple[Floats, Floats]:
 def _over_bent(points: Floats, around: Floats, plane: _Plane, unit: Floats) -> Floats:
     """Height of points (m, 3) over a surface of second order through neighbors (m, k, 3), in spacings and in those of
     the neighbors, and these: (m, 3)."""
-    width = np.maximum(plane.size[:, 2], 1e-300)
+    width = np.maximum(plane.size[:, 2], TINY)
 
     def terms(offsets: Floats) -> tuple[Floats, Floats]:
         rise, v, u = np.moveaxis(offsets @ plane.axes, 2, 0)

@@ -75,3 +75,16 @@ def test_few_points(points: int, others: int) -> None:
     found = features(rng.normal(size=(points, 3)), rng.normal(size=(others, 3)))
     assert found.shape == (points, DOUBT_FEATURES)
     assert np.isfinite(found).all()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("others", ["line", "one place", "plane", "places several times"])
+def test_degenerate_clouds(others: str) -> None:
+    rng = np.random.default_rng(3)
+    clouds = {
+        "line": np.linspace(0, 1, 100)[:, None] * [1.0, 2, 3],
+        "one place": np.ones((30, 3)),
+        "plane": grid(),
+        "places several times": rng.normal(size=(20, 3)).repeat(8, 0),
+    }
+    assert np.isfinite(features(rng.normal(size=(5, 3)), clouds[others])).all()
