@@ -42,8 +42,9 @@ def doubt_features(points: Floats, others: Floats, odds: NDArray[np.float32]) ->
     """
     others = others[np.lexsort(others.T)]
     center = others.mean(0)
-    radius = max(float(np.abs(others - center).max()), TINY)
-    points, others = (points - center) / radius, (others - center) / radius
+    points, others = points - center, others - center
+    extent = max(float(np.abs(others).max()), float(np.abs(points).max()), TINY)
+    points, others = points / extent, others / extent
     middle = int((others**2).sum(1).argmin())  # to begin with, however the cloud is turned
     others = np.concatenate([others[middle : middle + 1], np.delete(others, middle, 0)])
     counts = [min(len(others), max(len(others) // share, LEAST)) for share in SHARES]
