@@ -21,9 +21,10 @@ from pnu.runtime.threads import thread_count
 
 WEIGHTS = Path(__file__).parent  # all trained by pnu.training.outlier_training
 DOUBTFUL = -1.0  # logarithm of the odds from which on a point is looked at again, beside those that are not,
-SURE = 0.5  # and from which on it is then taken for stray,
-TORN = 3.5  # or in the picture of a camera
-MANY = 0.0035  # share of stray points from which on a cloud has many; noise of 1 % of the radius stays below
+SURE = 6.0  # and from which on it is then taken for stray,
+LIKELY = 0.5  # or this where there are many: a share of
+MANY = 0.0035  # of the points; tips of clean clouds, and noise of 1 % of the radius, stay below
+TORN = 3.5  # in the picture of a camera
 ROUNDS = 3  # a stray point hides another,
 SINGLE = 3  # but so few of them none
 PIECE = 12  # points below which a piece that stands apart is stray,
@@ -70,12 +71,15 @@ def stray_points(points: NDArray[np.float64], camera: NDArray[np.float64] | None
 
 def _in_space(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which points (n, 3) stay, (n,)."""
-    stays = np.ones(len(points), bool)
+    stays, enough = np.ones(len(points), bool), SURE
     for _ in range(ROUNDS):
         rows = np.flatnonzero(stays)
         if len(rows) < FEWEST:
             break
-        stray = _settled_odds(points[rows]) > SURE
+        odds = _settled_odds(points[rows])
+        if (odds > LIKELY).mean() > MANY:
+            enough = LIKELY
+        stray = odds > enough
         if stray.any():
             stray &= ~fit_in_order(points[rows])
         stays[rows[stray]] = False
