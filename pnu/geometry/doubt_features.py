@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnu.geometry.farthest_sampling import farthest_points_large
+from pnu.geometry.fitted_planes import FittedPlanes
 from pnu.geometry.point_tree import PointTree
 from pnu.runtime.threads import thread_count
 
@@ -83,35 +84,20 @@ class _Level(NamedTuple):
         return np.maximum(np.pad(distance, missing, mode="edge"), TINY), np.pad(near, missing, mode="edge")
 
 
-class _Plane(NamedTuple):
-    """Planes fitted to neighbors (m, k, 3): their middles, sizes along their axes, ascending, and these as columns."""
-
-    middle: Floats
-    size: Floats
-    axes: Floats
-
-    @classmethod
-    def of(cls, neighbors: Floats) -> "_Plane":
-        middle = neighbors.mean(1)
-        centered = neighbors - middle[:, None]
-        variance, axes = np.linalg.eigh(centered.transpose(0, 2, 1) @ centered / neighbors.shape[1])
-        return cls(middle, np.sqrt(np.maximum(variance, 0)), axes)
-
-
 def _beside(points: Floats, level: _Level) -> tuple[Floats, Floats]:
     """Features (m, 44) of points (m, 3) beside those of a level, and the spacing there, (m,)."""
     distance, near = level.nearest(points, NEIGHBORS)
     named, there = np.unique(near, return_inverse=True)
     there = there.reshape(near.shape)
     apart, own = level.nearest(level.points[named], OWN + 1)
-    planes = _Plane.of(level.points[own])
+    planes = FittedPlanes.of(level.points[own])
     normals = planes.axes[:, :, 0]
     rough = planes.size[:, 0] / np.maximum(np.linalg.norm(planes.size, axis=1), TINY)
     unit = np.median(apart[there, SPACED - 1], 1)  # above zero, as all distances are
     around = level.points[near]
     columns = [np.log(distance[:, RANKS - 1] / unit[:, None])]
     for k in PLANES:
-        plane = _Plane.of(around[:, :k])
+        plane = FittedPlanes.of(around[:, :k])
         offset = points - plane.middle
         height = np.abs((offset * plane.axes[:, :, 0]).sum(1))
         lengths = np.column_stack([height, np.linalg.norm(offset, axis=1)]) / unit[:, None]
@@ -127,7 +113,7 @@ def _beside(points: Floats, level: _Level) -> tuple[Floats, Floats]:
     return np.hstack(columns), unit
 
 
-def _over_bent(points: Floats, around: Floats, plane: _Plane, unit: Floats) -> Floats:
+def _over_bent(points: Floats, around: Floats, plane: FittedPlanes, unit: Floats) -> Floats:
     """Height of points (m, 3) over a surface of second order through neighbors (m, k, 3), in spacings and in those of
     the neighbors, and these: (m, 3)."""
     width = np.maximum(plane.size[:, 2], TINY)
@@ -148,7 +134,7 @@ def _over_bent(points: Floats, around: Floats, plane: _Plane, unit: Floats) -> F
 
 def _widest_side(points: Floats, around: Floats) -> Floats:
     """The widest angle, in their plane, between the ways from points (m, 3) to their neighbors (m, k, 3): (m,)."""
-    across = _Plane.of(around).axes[:, :, 1:]
+    across = FittedPlanes.of(around).axes[:, :, 1:]
     way = (around - points[:, None]) @ across
     angle = np.sort(np.arctan2(way[:, :, 1], way[:, :, 0]), 1)
     between: Floats = np.diff(np.concatenate([angle, angle[:, :1] + 2 * np.pi], 1), axis=1).max(1)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnu import kernels
+from pnu.geometry.fitted_planes import FittedPlanes
 from pnu.geometry.point_tree import PointTree
 from pnu.runtime import threads
 
@@ -100,11 +101,8 @@ def _planes(points: Floats, near: Indices, unit: Floats, part: slice) -> tuple[F
     """Of planes fitted to neighbors: the point's height over each, its way to their middle, their sizes; a normal."""
     found, normals = [], np.empty(0)
     for m in PLANES:
-        neighbors = points[near[:, :m]]
-        middle = neighbors.mean(1)
-        centered = neighbors - middle[:, None]
-        variance, axes = np.linalg.eigh(centered.transpose(0, 2, 1) @ centered / m)
-        offset, size = points[part] - middle, np.sqrt(np.maximum(variance, 0))
+        middle, size, axes = FittedPlanes.of(points[near[:, :m]])
+        offset = points[part] - middle
         height = np.abs((offset * axes[:, :, 0]).sum(1))
         lengths = np.column_stack([height, np.linalg.norm(offset, axis=1)]) / unit[:, None]
         sizes = np.log(size / unit[:, None] + 1e-3)
