@@ -29,7 +29,7 @@ def test_zero_within_and_as_it_was_before() -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_threads_take_them_as_the_thread_that_calls(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_take_them_as_the_thread_that_calls(threads: int) -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
