@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +22,6 @@ from pnu.networks.released import from_released
 from pnu.upsamplers.whole_clouds import upsample
 
 POINTS, RATIO, PATCH = 5000, 4, 1024
-SHIPS = 64  # points of the patches of the weights that ship
 SHARED = 10_000  # points of a cloud that processes share
 
 
@@ -83,12 +83,12 @@ def rows() -> Iterator[Row]:
     ).seconds
     for name, title in (("pnu", "network pnu"), ("surface", "surface")):
         yield Row(f"upsample {size}, {title}, warm", {"pnu": turns[name], theirs: turns[theirs]})
-    ships = load("pnu")
+    ships: Any = load("pnu")
     yield compare(
-        f"upsample {size}, pnu as it ships, patches of {SHIPS}, warm",
+        f"upsample {size}, pnu as it ships, patches of {ships.patch_size}, warm",
         {
             "pnu": partial(upsample, points, normals, model=ships),
-            theirs: partial(naive, ships, tensor, SHIPS),
+            theirs: partial(naive, ships, tensor, ships.patch_size),
         },
         rounds=2,
     )
