@@ -2,6 +2,7 @@
 
 import functools
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -141,7 +142,7 @@ def upsamplers(cfg: Any) -> dict[str, "Method"]:
 
     found: dict[str, Method] = {}
     names = Counter(run_name(method) for method in cfg.methods if Path(method).is_dir())
-    for method in [one for given in cfg.methods for one in runs_of_sweep(given) or [given]]:
+    for method in with_runs_of_sweeps(cfg.methods):
         name, _, folder = ("", "", method) if Path(method).exists() else method.rpartition(":")
         model: Any
         if folder in (*CLASSICAL, "open3d"):
@@ -182,7 +183,7 @@ def seen_in_training(cfg: Any, source: "CaseSource") -> list[str]:
 
     lines = []
     procedural = not cfg.data.get("root")
-    for method in [one for given in cfg.methods for one in runs_of_sweep(given) or [given]]:
+    for method in with_runs_of_sweeps(cfg.methods):
         name, _, folder = ("", "", method) if Path(method).exists() else method.rpartition(":")
         if folder in (*CLASSICAL, "open3d"):
             continue
@@ -194,6 +195,28 @@ def seen_in_training(cfg: Any, source: "CaseSource") -> list[str]:
         elif trained.unknown:
             lines.append(f"{name or folder}: whether these shapes were in its training is not known; {trained.unknown}")
     return lines
+
+
+def with_runs_of_sweeps(methods: Iterable[str]) -> list[str]:
+    """The methods, the folder of a sweep replaced by its runs.
+
+    Runs of several sweeps that have one name but for the seed are called NAME_seed-N, as those of one sweep are.
+    """
+    from pnu.networks.checkpoints import run_config
+
+    methods = list(methods)
+    listed = {method: runs_of_sweep(method) for method in methods}
+    names = [name for found in listed.values() for name, _, _ in (run.partition(":") for run in found)]
+    stems = Counter(name.rpartition("_seed-")[0] or name for name in names)
+
+    def told_apart(run: str) -> str:
+        name, _, folder = run.partition(":")
+        config = Path(folder, "config.yaml")
+        if "_seed-" in name or stems[name] < 2 or not config.is_file():
+            return run
+        return f"{name}_seed-{run_config(Path(folder)).get('seed', 0)}:{folder}"
+
+    return [one for method in methods for one in ([told_apart(run) for run in listed[method]] or [method])]
 
 
 def runs_of_sweep(method: str) -> list[str]:

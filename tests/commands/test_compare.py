@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from pnu.benchmark import Case, Truth
-from pnu.commands.compare import main, runs_of_sweep
+from pnu.commands.compare import main, runs_of_sweep, with_runs_of_sweeps
 from pnu.geometry.mesh_sampling import sample_poisson_disk
 from pnu.io import Mesh, read_json, write_json, write_mesh
 from pnu.networks import checkpoints
@@ -169,6 +169,24 @@ def test_the_finished_runs_of_a_sweep(place: Path) -> None:
     main([f"methods=[{place}/sweep,apss]", *data, *SMALL, f"output={place}/swept"])
     rows = read_json(place / "swept" / "metrics.json")["rows"]
     assert [row["method"] for row in rows] == ["no_cd", "wide", "apss", "floor", "input"]
+
+
+def test_runs_of_several_sweeps_are_told_apart_by_their_seeds(tmp_path: Path) -> None:
+    """A seed that alone was asked for is not in the names of its sweep."""
+    two, one = tmp_path / "two", tmp_path / "one"
+    runs = {two / "wide_seed-0_01": 0, two / "wide_seed-1_02": 1, one / "wide_03": 2, one / "slim_04": 2}
+    for folder, seed in runs.items():
+        folder.mkdir(parents=True)
+        write_json(folder / "run.json", {"status": "finished"})
+        (folder / "config.yaml").write_text(f"model: {{}}\nseed: {seed}\n")
+    assert with_runs_of_sweeps([str(two), "apss", str(one)]) == [
+        f"wide_seed-0:{two}/wide_seed-0_01",
+        f"wide_seed-1:{two}/wide_seed-1_02",
+        "apss",
+        f"slim:{one}/slim_04",
+        f"wide_seed-2:{one}/wide_03",
+    ]
+    assert with_runs_of_sweeps([str(one)]) == [f"slim:{one}/slim_04", f"wide:{one}/wide_03"]
 
 
 def case() -> Case:
