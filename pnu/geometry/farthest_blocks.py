@@ -10,12 +10,11 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import count
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pnu.geometry.point_tree import PointTree
 from pnu.geometry.spatial_blocks import Blocks, Index, split_blocks
 from pnu.runtime.progress import Step, silent
 
@@ -26,8 +25,15 @@ TRIES = 3  # of so many
 MARGIN = 4  # distances around a block within which it sees its neighbors
 PROBES = 48  # chosen points whose distance to those chosen before is looked up
 
-Choose = Callable[[NDArray[np.float32], int], Index]
-"""choose(points (n, 3), m) -> m farthest points from point 0 on, in the order of choice."""
+Apart = NDArray[np.float32]
+
+
+class Choose(Protocol):
+    """`pnu.geometry.farthest_sampling.farthest_apart`."""
+
+    def __call__(
+        self, xyz: NDArray[np.float32], m: int, *, given: int = 0, least: float = 0.0
+    ) -> tuple[Index, Apart]: ...
 
 
 class Decline(NamedTuple):
@@ -36,10 +42,6 @@ class Decline(NamedTuple):
     number: NDArray[np.float64]  # ascending
     distance: NDArray[np.float64]  # not ascending
     most: int  # points there are
-
-    def at(self, number: NDArray[np.int64]) -> NDArray[np.float64]:
-        """The distance (k,) when so many points (k,) were chosen, interpolated."""
-        return np.interp(number, self.number, self.distance)
 
     def before(self, distance: float) -> float:
         """Points chosen before the distance falls below `distance`; on, as on a surface, where no more were chosen."""
@@ -79,7 +81,7 @@ def farthest_in_blocks(
 
         def first(members: Index) -> Decline:
             number = min(int(1.1 * wanted * len(members) / n) + 16, len(members))
-            return decline_of(xyz[members[choose(xyz[members], number)]], len(members))
+            return decline_of(choose(xyz[members], number)[1], len(members))
 
         declines = []
         for decline in pool.map(first, blocks.members):
@@ -88,7 +90,7 @@ def farthest_in_blocks(
         reach, power, before = _common_distance(declines, wanted), 2.0, (0.0, 0)
         for attempt in count():
             total = (2 + attempt) * len(blocks.members)
-            chosen, distance = _choose_all(xyz, blocks, declines, reach, choose, pool, tick)
+            chosen, distance = _choose_all(xyz, blocks, reach, choose, pool, tick)
             surplus = len(chosen) / m
             if surplus >= 1 and (surplus <= CLOSE or attempt >= TRIES or len(chosen) == n):
                 return chosen[np.argsort(-distance, kind="stable")[:m]]
@@ -106,7 +108,6 @@ def farthest_in_blocks(
 def _choose_all(
     xyz: NDArray[np.float32],
     blocks: Blocks,
-    declines: list[Decline],
     reach: float,
     choose: Choose,
     pool: ThreadPoolExecutor,
@@ -124,28 +125,15 @@ def _choose_all(
         near = [chosen[other] for other in blocks.near(number, margin)]
         fixed = np.concatenate([none, *(idx[blocks.inside(xyz[idx], number, margin)] for idx in near)])
         halo = blocks.halo(xyz, number, margin)
-        free = np.concatenate([own, halo[waiting[halo]]])
-        if len(fixed):
-            free = free[PointTree(xyz[fixed]).nearest(xyz[free], 1)[0][:, 0] >= reach]
-        both = np.concatenate([fixed, free])
-        if not len(free):
-            return none, np.empty(0)
-        share = declines[number].before(reach) / len(own)
-        m = min(len(fixed) + int(1.02 * share * len(free)) + 16, len(both))
-        while True:
-            order = choose(xyz[both], m)
-            decline = decline_of(xyz[both[order]], len(both))
-            if m == len(both) or decline.distance[-1] < reach:
-                break
-            m = min(max(int(1.05 * decline.before(reach)), m + m // 20 + 16), len(both))
-        order = order[: round(decline.before(reach))]
-        mine = np.flatnonzero((order >= len(fixed)) & np.isin(both[order], own, assume_unique=True))
+        both = np.concatenate([fixed, own, halo[waiting[halo]]])
+        order, far = choose(xyz[both], len(both), given=len(fixed), least=reach)
+        mine = (order >= len(fixed)) & (order < len(fixed) + len(own))
         idx = both[order[mine]]
         # near a border the distance may be one to a point that the neighbor will not choose: such points are kept
         seen = np.zeros(len(idx), bool)
         for other in blocks.near(number, margin):
             seen |= blocks.inside(xyz[idx], other, 2 * reach)
-        return idx, np.where(seen, np.inf, decline.at(mine))
+        return idx, np.where(seen, np.inf, far[mine])
 
     for group in blocks.colors(margin):
         for number in group:
@@ -156,23 +144,19 @@ def _choose_all(
 
     def fill(number: int) -> tuple[Index, NDArray[np.float64]]:
         """Holes at the borders, where a block relied on points of a neighbor's that were not chosen in the end."""
-        own, near = blocks.members[number], blocks.near(number, margin)
-        edge = np.zeros(len(own), bool)
+        own, mine, near = blocks.members[number], chosen[number], blocks.near(number, margin)
+        edge, beside = np.zeros(len(own), bool), np.zeros(len(mine), bool)
         for other in near:
             edge |= blocks.inside(xyz[own], other, reach)
-        free = own[edge]
-        around = [idx[blocks.inside(xyz[idx], number, margin)] for idx in (chosen[other] for other in [number, *near])]
-        taken = np.concatenate(around)
+            beside |= blocks.inside(xyz[mine], other, 2 * reach)
+        theirs = [chosen[other][blocks.inside(xyz[chosen[other]], number, reach)] for other in near]
+        taken, free = np.concatenate([mine[beside], *theirs]), np.setdiff1d(own[edge], mine)
         if not len(free) or not len(taken):
             return none, np.empty(0)
-        far = PointTree(xyz[taken]).nearest(xyz[free], 1)[0][:, 0]
-        added, distances = [none], [np.empty(0)]
-        while (far >= reach).any() and far.max() > 0:
-            farthest = far.argmax()
-            added.append(free[[farthest]])
-            distances.append(np.array([np.inf]))
-            far = np.minimum(far, np.linalg.norm(xyz[free] - xyz[free[farthest]], axis=1))
-        return np.concatenate(added), np.concatenate(distances)
+        both = np.concatenate([taken, free])
+        order, _ = choose(xyz[both], len(both), given=len(taken), least=reach)
+        added = both[order[len(taken) :]]
+        return added, np.full(len(added), np.inf)
 
     for group in blocks.colors(margin):
         for number, (idx, far) in zip(group, pool.map(fill, group), strict=True):
@@ -181,19 +165,13 @@ def _choose_all(
     return np.concatenate(chosen), np.concatenate(distance)
 
 
-def decline_of(points: NDArray[np.floating], most: int) -> Decline:
-    """From points in the order of choice."""
-    m = len(points)
-    probes = np.unique(np.linspace(m // 8, m - 1, PROBES).astype(np.int64))
-    k = min(PROBES, m)
-    far, idx = PointTree(points).nearest(points[probes], k)
-    before = idx < probes[:, None]
-    found = before.any(1)
-    if not found.any():
+def decline_of(apart: Apart, most: int) -> Decline:
+    """From the distances (m,) of points from all chosen before them, in the order of choice."""
+    m = len(apart)
+    if m == 1:
         return Decline(np.array([1.0]), np.array([np.inf]), most)
-    distance = np.take_along_axis(far, before.argmax(1)[:, None], 1)[found, 0]
-    falling = np.asarray(np.minimum.accumulate(distance), np.float64)
-    return Decline(np.asarray(probes[found] + 1.0, np.float64), falling, most)
+    probes = np.unique(np.linspace(max(m // 8, 1), m - 1, PROBES).astype(np.int64))
+    return Decline(probes.astype(np.float64) + 1, apart[probes].astype(np.float64), most)
 
 
 def _common_distance(declines: list[Decline], wanted: float) -> float:

@@ -9,7 +9,7 @@ from pnu.geometry.spatial_blocks import split_blocks
 from pnu.runtime.progress import Step, silent
 from pnu.runtime.threads import thread_count
 
-LARGE = 2**18  # points; more are sampled in blocks,
+LARGE = 2**20  # points; more are sampled in blocks,
 LARGE_BLOCK: int | None = None  # of so many points, None the default of `farthest_blocks`,
 LARGE_SHARE = 64  # unless so few are wanted that blocks would hold too few of them
 BLOCKS_PAY = 2**14  # points from which on plain steps look at near blocks alone,
@@ -23,24 +23,20 @@ def farthest_points_large(points: NDArray[np.floating], m: int, *, step: Step = 
     Beyond LARGE points it works block by block (`farthest_blocks`), as evenly but from another point on, in time
     linear in n. ValueError if m is not in 1..n.
     """
-    points = np.asarray(points)
     check_count(m, len(points))
-    if points.dtype == np.float64:  # map coordinates, say, lose their detail in float32
-        points = points - points.mean(0)
-    array = np.ascontiguousarray(points, np.float32)
+    array = single_precision(points)
     if len(array) <= LARGE or m < len(array) // LARGE_SHARE:
         step(0, 1)
         chosen = farthest_order(array, m, 0)
         step(1, 1)
         return chosen
-    return farthest_in_blocks(
-        array,
-        m,
-        lambda part, number: farthest_order(part, number, 0),
-        threads=thread_count(),
-        size=LARGE_BLOCK,
-        step=step,
-    )
+    return farthest_in_blocks(array, m, farthest_apart, threads=thread_count(), size=LARGE_BLOCK, step=step)
+
+
+def single_precision(points: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Points (n, 3), those in float64 about their mean: map coordinates, say, lose their detail in float32."""
+    points = np.asarray(points)
+    return np.ascontiguousarray(points - points.mean(0) if points.dtype == np.float64 else points, np.float32)
 
 
 def check_count(m: int, n: int) -> None:
@@ -50,34 +46,55 @@ def check_count(m: int, n: int) -> None:
 
 
 def farthest_order(xyz: NDArray[np.float32], m: int, start: int) -> NDArray[np.int64]:
-    """m farthest points of (n, 3) from `start` on, in the order of choice, (m,).
+    """m farthest points of (n, 3) from `start` on, in the order of choice, (m,)."""
+    return farthest_apart(xyz, m, start=start)[0]
 
-    Of equal distances the lowest index, so that all three ways give the same.
+
+def farthest_apart(
+    xyz: NDArray[np.float32], m: int, *, start: int = 0, given: int = 0, least: float = 0.0
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Farthest points of (n, 3) in the order of choice, and how far each is from all chosen before: (k,) and (k,).
+
+    The first `given` points are chosen already, else `start` is first; their distance is infinite. It ends with m
+    points, or where none is at least `least` away from those chosen. Of equal distances the lowest index, so that all
+    three ways give the same.
     """
     if not np.isfinite(xyz).all():  # as in a training that breaks, which is told elsewhere
         with np.errstate(invalid="ignore"):
-            return _farthest_plain(xyz, m, start)
+            return _farthest_plain(xyz, m, start, given, least)
     if kernels.ready():
         from pnu.kernels.greedy_sampling import farthest_first
 
-        return farthest_first(xyz, m, start)
-    return (_farthest_near if len(xyz) > BLOCKS_PAY else _farthest_plain)(xyz, m, start)
+        return farthest_first(xyz, m, start, given, least)
+    return (_farthest_near if len(xyz) > BLOCKS_PAY else _farthest_plain)(xyz, m, start, given, least)
 
 
-def _farthest_plain(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
+def _farthest_plain(
+    xyz: NDArray[np.float32], m: int, start: int, given: int = 0, least: float = 0.0
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     axes, step = np.ascontiguousarray(xyz.T), np.empty_like(xyz.T, order="C")
-    dist_sq, chosen = np.full(len(xyz), np.inf, np.float32), np.empty(m, np.int64)
+    dist_sq, least_sq = np.full(len(xyz), np.inf, np.float32), np.float32(least) ** 2
+    chosen, apart_sq = np.empty(m, np.int64), np.full(m, np.inf, np.float32)
+    count = 0
     for i in range(m):
-        chosen[i] = start
+        if i < given:
+            start = i
+        elif i:
+            start = int(dist_sq.argmax())
+            apart_sq[i] = dist_sq[start]
+            if apart_sq[i] < least_sq:
+                break
+        chosen[i], count = start, i + 1
         np.subtract(axes, axes[:, start, None], out=step)
         np.multiply(step, step, out=step)
         np.minimum(dist_sq, step.sum(0), out=dist_sq)
         dist_sq[start] = -1
-        start = int(dist_sq.argmax())
-    return chosen
+    return chosen[:count], np.sqrt(apart_sq[:count])
 
 
-def _farthest_near(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
+def _farthest_near(
+    xyz: NDArray[np.float32], m: int, start: int, given: int = 0, least: float = 0.0
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """The same with a look at those blocks alone that are nearer than their farthest point is to all chosen before."""
     blocks = split_blocks(xyz, NEAR_BLOCK)
     number, size = len(blocks.members), max(len(part) for part in blocks.members)
@@ -88,9 +105,17 @@ def _farthest_near(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
         home[part, 0], home[part, 1] = row, np.arange(len(part))
     low, high = (np.ascontiguousarray(corners.T, np.float32) for corners in (blocks.low, blocks.high))
     best, best_id = dist_sq.max(1), ids[:, 0].copy()
-    chosen = np.empty(m, np.int64)
+    chosen, apart_sq = np.empty(m, np.int64), np.full(m, np.inf, np.float32)
+    least_sq, count = np.float32(least) ** 2, 0
     for i in range(m):
-        chosen[i] = start
+        if i < given:
+            start = i
+        elif i:
+            apart_sq[i] = best.max()
+            start = int(best_id[best == apart_sq[i]].min())
+            if apart_sq[i] < least_sq:
+                break
+        chosen[i], count = start, i + 1
         place, own = xyz[start, :, None], home[start, 0]
         apart = np.maximum(np.maximum(low - place, place - high), 0)
         near = (apart * apart).sum(0) < best
@@ -102,5 +127,4 @@ def _farthest_near(xyz: np.ndarray, m: int, start: int) -> np.ndarray:
         dist_sq[rows] = part
         farthest = part.argmax(1)
         best[rows], best_id[rows] = part[np.arange(len(rows)), farthest], ids[rows, farthest]
-        start = int(best_id[best == best.max()].min())
-    return chosen
+    return chosen[:count], np.sqrt(apart_sq[:count])

@@ -26,9 +26,11 @@ class Blocks(NamedTuple):
 
     def inside(self, points: Points, number: int, margin: float) -> NDArray[np.bool_]:
         """Which points (n, 3) lie in the box of a block, grown by `margin` on all sides."""
-        within = (points >= self.low[number] - margin) & (points <= self.high[number] + margin)
-        every: NDArray[np.bool_] = within.all(1)
-        return every
+        low, high = self.low[number] - margin, self.high[number] + margin
+        within = np.ones(len(points), bool)
+        for axis in range(3):
+            within &= (points[:, axis] >= low[axis]) & (points[:, axis] <= high[axis])
+        return within
 
     def halo(self, points: Points, number: int, margin: float) -> Index:
         """Points of the cloud that are no members of a block but in its box, grown by `margin`."""

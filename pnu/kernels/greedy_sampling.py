@@ -18,12 +18,15 @@ UNKNOWN, CHOSEN, NO_POINT = f32(1e30), f32(-1), f32(-2)  # instead of the square
 OUTSIDE = f32(1e18)  # corners of empty boxes; its square is finite
 
 
-def farthest_first(points: NDArray[np.float32], m: int, start: int) -> Ints:
-    """From `start` on always the point farthest from all chosen before: points (n, 3) -> (m,) indices, m <= n."""
+def farthest_first(
+    points: NDArray[np.float32], m: int, start: int, given: int = 0, least: float = 0.0
+) -> tuple[Ints, NDArray[np.float32]]:
+    """`pnu.geometry.farthest_sampling.farthest_apart` of points (n, 3), m <= n: indices (k,) and distances (k,)."""
     points = np.require(points, np.float32, ["C", "W", "A"])
-    chosen = np.empty(m, np.int64)
-    _choose(points, box_order(points.astype(np.float64), LEAF), start, chosen)
-    return chosen
+    chosen, apart_sq = np.empty(m, np.int64), np.full(m, np.inf, np.float32)
+    least_sq, count = np.full(1, least, np.float32) ** 2, np.zeros(1, np.int64)
+    _choose(points, box_order(points.astype(np.float64), LEAF), start, given, least_sq, chosen, apart_sq, count)
+    return chosen[: count[0]], np.sqrt(apart_sq[: count[0]])
 
 
 @kernel(exact=True, inner=True)
@@ -63,8 +66,13 @@ def _join(best: Singles, best_id: Ints, node: int) -> None:
     best[node], best_id[node] = best[left], best_id[left]
 
 
-@kernel("void(float32[:, ::1], int64[::1], int64, int64[::1])", exact=True)
-def _choose(points: Singles, order: Ints, start: int, chosen: Ints) -> None:
+@kernel(
+    "void(float32[:, ::1], int64[::1], int64, int64, float32[::1], int64[::1], float32[::1], int64[::1])", exact=True
+)
+def _choose(
+    points: Singles, order: Ints, start: int, given: int, least_sq: Singles, chosen: Ints, apart_sq: Singles,
+    count: Ints,
+) -> None:  # fmt: skip
     """See `farthest_first`; order: of boxes, in leaves of LEAF points."""
     n = len(points)
     filled = (n + LEAF - 1) // LEAF
@@ -100,7 +108,15 @@ def _choose(points: Singles, order: Ints, start: int, chosen: Ints) -> None:
     passed, waiting = np.empty(2 * leaves, np.int64), np.empty(128, np.int64)
     current = start
     for step in range(len(chosen)):
+        if step < given:
+            current = step
+        elif step:
+            current = best_id[1]
+            apart_sq[step] = best[1]
+            if best[1] < least_sq[0]:
+                break
         chosen[step] = current
+        count[0] = step + 1
         at = position[current]
         x, y, z = axes[0, at], axes[1, at], axes[2, at]
         dist[at] = CHOSEN
@@ -127,4 +143,3 @@ def _choose(points: Singles, order: Ints, start: int, chosen: Ints) -> None:
         while node:
             _join(best, best_id, node)
             node //= 2
-        current = best_id[1]

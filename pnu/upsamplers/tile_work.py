@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from pnu.cleaning import stray_points
 from pnu.geometry.anisotropy import averaged
 from pnu.geometry.even_spacing import RANK, tangent_discs
-from pnu.geometry.farthest_blocks import decline_of
-from pnu.geometry.farthest_sampling import farthest_points_large
+from pnu.geometry.farthest_sampling import farthest_apart, farthest_order, single_precision
 from pnu.geometry.normal_estimation import complete_normals
 from pnu.geometry.normal_sides import seen_signs, voted_signs
 from pnu.geometry.point_tree import PointTree
@@ -129,15 +128,9 @@ def prepared(plan: Plan, number: int) -> None:
 
 def thinned_to(points: NDArray[np.float64], distance: float) -> NDArray[np.int64]:
     """Rows of those of the points (n, 3), ascending, that farthest points take down to a distance between them."""
-    n = len(points)
-    m = n
-    for share in (0.25, 0.5, 1.0):
-        m = max(math.ceil(share * n), min(n, 16))
-        order = farthest_points_large(points, m)
-        decline = decline_of(points[order], n)
-        if m == n or decline.distance[-1] < distance:
-            break
-    return np.sort(order[: max(round(min(decline.before(distance), m)), min(n, 16))])
+    single, few = single_precision(points), min(len(points), 16)
+    order, _ = farthest_apart(single, len(points), least=distance)
+    return np.sort(order if len(order) >= few else farthest_order(single, few, 0))
 
 
 def _normals(plan: Plan, rows: NDArray[Any]) -> NDArray[np.float64]:

@@ -87,7 +87,7 @@ def test_all_ways_choose_the_same(n: int) -> None:
     for start in (0, 1, n // 2, n - 1):
         fast = farthest_points(points, 200, start=start)
         assert torch.equal(fast, module._farthest_steps(points, 200, torch.tensor([start]), False))
-        np.testing.assert_array_equal(fast[0], farthest_sampling._farthest_near(points[0].numpy(), 200, start))
+        np.testing.assert_array_equal(fast[0], farthest_sampling._farthest_near(points[0].numpy(), 200, start)[0])
 
 
 def test_one_start_for_each_cloud() -> None:

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from pnu.geometry import farthest_sampling
 from pnu.geometry.farthest_blocks import farthest_in_blocks
-from pnu.geometry.farthest_sampling import farthest_points_large
+from pnu.geometry.farthest_sampling import farthest_apart, farthest_points_large
 from pnu.geometry.spatial_blocks import along_curve, split_blocks
 
 SIZE = 2**12  # of a block
@@ -40,7 +40,7 @@ def at_border(points: np.ndarray, chosen: np.ndarray, width: float) -> np.ndarra
 def test_borders_are_as_even_as_the_inside(share: float) -> None:
     points = sphere(60_000)
     m = round(share * len(points))
-    chosen = farthest_in_blocks(points, m, choose, size=SIZE)
+    chosen = farthest_in_blocks(points, m, farthest_apart, size=SIZE)
     assert chosen.shape == np.unique(chosen).shape == (m,)
     # mean and deviation of both spacings, at the places of the borders and elsewhere, beside those without blocks
     whole = choose(points, m)
@@ -68,7 +68,7 @@ def test_a_joint_of_independent_blocks_would_be_seen() -> None:
 def test_uneven_clouds_become_even() -> None:
     points = sphere(80_000)
     points = points[np.random.default_rng(0).random(len(points)) < np.where(points[:, 2] > 0, 1, 0.1)]
-    chosen, whole = farthest_in_blocks(points, 4000, choose, size=SIZE), choose(points, 4000)
+    chosen, whole = farthest_in_blocks(points, 4000, farthest_apart, size=SIZE), choose(points, 4000)
     up, expected = ((points[idx, 2] > 0).mean() for idx in (chosen, whole))
     assert up == pytest.approx(expected, abs=0.01)
     np.testing.assert_allclose(spacing(points[chosen]).mean(0), spacing(points[whole]).mean(0), rtol=0.01)
@@ -76,7 +76,7 @@ def test_uneven_clouds_become_even() -> None:
 
 def test_threads_do_not_matter_and_front_parts_are_even() -> None:
     points = sphere(30_000)
-    one, three = (farthest_in_blocks(points, 9000, choose, size=SIZE, threads=threads) for threads in (1, 3))
+    one, three = (farthest_in_blocks(points, 9000, farthest_apart, size=SIZE, threads=threads) for threads in (1, 3))
     np.testing.assert_array_equal(one, three)
     front = points[one[: len(one) // 2]]
     random = points[: len(front)]
@@ -87,15 +87,15 @@ def test_threads_do_not_matter_and_front_parts_are_even() -> None:
 @pytest.mark.parametrize("m", [19_999, 20_000, 19_000])
 def test_nearly_all_points(m: int) -> None:
     points = sphere(20_000)
-    assert len(np.unique(farthest_in_blocks(points, m, choose, size=SIZE))) == m
+    assert len(np.unique(farthest_in_blocks(points, m, farthest_apart, size=SIZE))) == m
 
 
 def test_repeated_points() -> None:
     points = sphere(6000).repeat(4, 0)
-    chosen = farthest_in_blocks(points, 6000, choose, size=SIZE)
+    chosen = farthest_in_blocks(points, 6000, farthest_apart, size=SIZE)
     assert len(np.unique(chosen)) == 6000
     assert len(np.unique(points[chosen], axis=0)) > 5500
-    assert len(np.unique(farthest_in_blocks(points, 9000, choose, size=SIZE))) == 9000
+    assert len(np.unique(farthest_in_blocks(points, 9000, farthest_apart, size=SIZE))) == 9000
 
 
 def test_large_clouds_take_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,7 +111,7 @@ def test_large_clouds_take_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_way_is_told() -> None:
     points, steps = sphere(20_000), []
-    farthest_in_blocks(points, 5000, choose, size=SIZE, threads=2, step=lambda *step: steps.append(step))
+    farthest_in_blocks(points, 5000, farthest_apart, size=SIZE, threads=2, step=lambda *step: steps.append(step))
     done, totals = zip(*steps, strict=True)
     assert list(done) == list(range(len(done)))
     assert done[-1] == totals[-1] >= 2 * len(split_blocks(points, SIZE).members)

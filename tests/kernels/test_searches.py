@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
 from pnu.geometry import farthest_sampling
 from pnu.geometry.point_tree import PointTree
@@ -98,14 +99,35 @@ def test_a_tree_without_kernels_finds_the_same(monkeypatch: pytest.MonkeyPatch, 
 @pytest.mark.parametrize("n", [1, 2, 63, 64, 65, 200, 2000])
 def test_farthest_points_are_those_of_plain_steps(monkeypatch: pytest.MonkeyPatch, n: int, kind: str) -> None:
     points = cloud(kind, n).astype(np.float32)
-    for m in {1, max(n // 2, 1), n}:
-        found = farthest_sampling.farthest_order(points, m, n // 3)
-        np.testing.assert_array_equal(found, farthest_sampling._farthest_plain(points, m, n // 3))
-        assert len(set(found)) == m
     monkeypatch.setattr(farthest_sampling, "NEAR_BLOCK", 50)
-    np.testing.assert_array_equal(
-        farthest_sampling._farthest_near(points, n // 2 + 1, 0), farthest_sampling.farthest_order(points, n // 2 + 1, 0)
-    )
+    spread = float(np.ptp(points, axis=0).max())
+    cases = [{"start": n // 3}, {"given": n // 3}, {"given": n // 4, "least": spread / 8}, {"least": spread / 20}]
+    for m in {1, max(n // 2, 1), n}:
+        for case in cases:
+            idx, apart = farthest_sampling.farthest_apart(points, m, **case)  # type: ignore[arg-type]
+            options = {"start": 0} | case
+            for plain in (farthest_sampling._farthest_plain, farthest_sampling._farthest_near):
+                expected, expected_apart = plain(points, m, **options)  # type: ignore[arg-type]
+                np.testing.assert_array_equal(idx, expected)
+                np.testing.assert_array_equal(apart, expected_apart)
+            assert len(set(idx)) == len(idx) == (m if "least" not in case else len(idx))
+            given = min(int(case.get("given", 0)), m)
+            np.testing.assert_array_equal(idx[:given], np.arange(given))
+            assert np.isinf(apart[: max(given, 1)]).all()
+            assert (apart[max(given, 1) :] >= np.float32(case.get("least", 0))).all()
+
+
+@pytest.mark.usefixtures("compiled")
+def test_farthest_points_stop_where_all_is_near_those_chosen() -> None:
+    points = cloud("random", 2000).astype(np.float32)
+    least = 0.2 * float(np.ptp(points, axis=0).max())
+    idx, apart = farthest_sampling.farthest_apart(points, 2000, given=5, least=least)
+    between = cKDTree(points[idx]).query(points)[0]
+    assert 5 < len(idx) < 500
+    assert between.max() < least
+    far = np.linalg.norm(points[idx[5:], None] - points[idx], axis=2)
+    before = np.where(np.arange(len(idx)) < np.arange(5, len(idx))[:, None], far, np.inf).min(1)
+    np.testing.assert_allclose(apart[5:], before, rtol=1e-5)
 
 
 @pytest.mark.usefixtures("compiled")
