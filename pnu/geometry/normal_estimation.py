@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pnu.geometry.orientation import ROWS, SOME_NOISE, NeighborCloud, agreeing_normals, field, signs
+from pnu import kernels
+from pnu.geometry.orientation import CHUNK, ROWS, SOME_NOISE, NeighborCloud, agreeing_normals, field, signs
 from pnu.geometry.point_tree import PointTree
-from pnu.runtime.threads import thread_count
+from pnu.runtime.threads import map_on_threads, thread_count
 
 Array = NDArray[Any]  # float64 or float32
 Index = NDArray[np.int64]
@@ -69,13 +72,23 @@ def flip_to_reference(normals: Array, points: Array, ref_points: Array, ref_norm
     return np.where(side < 0, -normals, normals)
 
 
-def _plane_normals(points: Array, idx: Index, weight: Array | None = None) -> NDArray[np.float64]:
-    """Direction of least variance of points[idx], (n, 3); idx (n, k), weights (n, k)."""
+def _plane_normals(points: Array, idx: Index) -> NDArray[np.float64]:
+    """Direction of least variance of points[idx], (n, 3); idx (n, k)."""
+    if not kernels.ready():
+        return _weighted_planes(points, idx, lambda rows: np.ones((*idx[rows].shape, 1)))
+    from pnu.kernels.planes import plane_normals
+
+    normals, xyz, idx = np.empty((len(idx), 3)), np.ascontiguousarray(points, np.float64), np.ascontiguousarray(idx)
+    map_on_threads(lambda part: plane_normals(xyz, idx, part.start, normals[part]), parts_of(len(idx)))
+    return normals
+
+
+def _weighted_planes(points: Array, idx: Index, weights: Callable[[slice], Array]) -> NDArray[np.float64]:
+    """`_plane_normals` by weights (m, k, 1) of some rows."""
     normals = np.empty((len(idx), 3))
     for start in range(0, len(idx), ROWS):
         rows = slice(start, start + ROWS)
-        near = points[idx[rows]].astype(np.float64)
-        share = np.ones_like(near[..., :1]) if weight is None else weight[rows, :, None].astype(np.float64)
+        near, share = points[idx[rows]].astype(np.float64), weights(rows).astype(np.float64)
         near -= (share * near).sum(1, keepdims=True) / share.sum(1, keepdims=True)
         normals[rows] = np.linalg.eigh(near.swapaxes(1, 2) @ (share * near))[1][:, :, 0]
     return normals
@@ -97,20 +110,37 @@ def _refined(cloud: NeighborCloud, lines: Array, *, oriented: bool = False) -> A
 
 def _sheet_normals(cloud: NeighborCloud, normals: NDArray[np.float32], noise: float) -> NDArray[np.float32]:
     """Plane fits to the neighbors that face the same way and lie near the tangent plane, signs kept."""
-    k = round(32 * min(1 + 3 * noise, 1.5))
-    lines = np.empty_like(normals)
-    sharpness, wide = f32(4 / (1 + 6 * noise)), f32(0.5 + 3 * noise)
-    for start in range(0, len(normals), ROWS):
-        rows = slice(start, start + ROWS)
-        idx, normal = cloud.idx[rows, :k], normals[rows, None]
-        offset = cloud.points[idx] - cloud.points[rows, None]
-        distance = np.linalg.norm(offset, axis=-1)
-        reach = np.maximum(distance[:, -1:], f32(1e-9)) / f32(1.5)
-        rise = np.abs((offset * normal).sum(-1)) + np.abs((offset * normals[idx]).sum(-1))
-        facing = np.maximum((normal * normals[idx]).sum(-1), f32(0)) ** sharpness
-        weight = facing * np.exp(-((distance / reach) ** 2) - (rise / (wide * reach)) ** 2)
-        weight[:, 0] = 1
-        lines[rows] = _plane_normals(cloud.points, idx, weight)
-    cosine = (lines * normals).sum(1, keepdims=True)
-    # a fit across the given normal has found something else than its sheet
-    return np.where(np.abs(cosine) < 0.3, normals, lines * np.sign(cosine))
+    k = min(round(32 * min(1 + 3 * noise, 1.5)), cloud.idx.shape[1])
+    shape = np.array([4 / (1 + 6 * noise), 0.5 + 3 * noise])
+    if not kernels.ready():
+        lines = _weighted_planes(cloud.points, cloud.idx[:, :k], partial(sheet_weights, cloud, normals, k, shape))
+        cosine = (lines * normals).sum(1, keepdims=True)
+        # a fit across the given normal has found something else than its sheet
+        return np.where(np.abs(cosine) < 0.3, normals, lines * np.sign(cosine)).astype(f32)
+    from pnu.kernels.planes import sheet_normals
+
+    xyz, given, idx = (np.ascontiguousarray(v) for v in (cloud.points.astype(float), normals.astype(float), cloud.idx))
+    found = np.empty_like(given)
+    map_on_threads(lambda part: sheet_normals(xyz, given, idx, k, shape, part.start, found[part]), parts_of(len(given)))
+    return found.astype(f32)
+
+
+def sheet_weights(
+    cloud: NeighborCloud, normals: NDArray[np.float32], k: int, shape: NDArray[np.float64], rows: slice
+) -> NDArray[np.float32]:
+    """Weights (m, k, 1) of the k neighbors of some points: of those on the same sheet, by distance from the point, from
+    both tangent planes, and angle between normals, with sharpness and width (2,)."""
+    idx, normal, (sharpness, wide) = cloud.idx[rows, :k], normals[rows, None], shape.astype(f32)
+    offset = cloud.points[idx] - cloud.points[rows, None]
+    distance = np.linalg.norm(offset, axis=-1)
+    reach = np.maximum(distance[:, -1:], f32(1e-9)) / f32(1.5)
+    rise = np.abs((offset * normal).sum(-1)) + np.abs((offset * normals[idx]).sum(-1))
+    facing = np.maximum((normal * normals[idx]).sum(-1), f32(0)) ** sharpness
+    weight = facing * np.exp(-((distance / reach) ** 2) - (rise / (wide * reach)) ** 2)
+    weight[:, 0] = 1
+    return np.asarray(weight[..., None])
+
+
+def parts_of(n: int) -> list[slice]:
+    """Rows of n points that a thread treats at once."""
+    return [slice(first, min(first + CHUNK, n)) for first in range(0, n, CHUNK)]

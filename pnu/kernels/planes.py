@@ -1,4 +1,4 @@
-"""Planes fitted to the neighbors of each point, and what `pnu.geometry.outlier_features` tells of them."""
+"""Planes fitted to the neighbors of each point: normals, and what `pnu.geometry.outlier_features` tells of them."""
 
 from typing import Any
 
@@ -8,6 +8,7 @@ from pnu.kernels.boxes import Floats, Ints
 from pnu.kernels.compilation import kernel
 
 SWEEPS = 12  # of Jacobi's method; five are enough as a rule
+ACROSS = 0.3  # cosine with the given normal below which a fit has found something else than its sheet
 PLANE, FELLOW = 6, 5  # features of a plane, and of a point among its fellows
 
 
@@ -49,6 +50,66 @@ def _eigen(a: Floats, axes: Floats) -> Any:
     column = 0 if x <= y and x <= z else (1 if y <= z else 2)
     low, high = min(min(x, y), z), max(max(x, y), z)
     return low, max(min(x, y), min(max(x, y), z)), high, column
+
+
+@kernel(inner=True)
+def _least(points: Floats, near: Ints, i: int, k: int, weights: Floats, a: Floats, axes: Floats) -> int:
+    """Column of `axes` (3, 3) along which the first k neighbors near[i], by their weights (k,), vary least."""
+    total = mx = my = mz = 0.0
+    for j in range(k):
+        p, w = near[i, j], weights[j]
+        total += w
+        mx, my, mz = mx + w * points[p, 0], my + w * points[p, 1], mz + w * points[p, 2]
+    mx, my, mz = mx / total, my / total, mz / total
+    a[:] = 0
+    for j in range(k):
+        p, w = near[i, j], weights[j]
+        dx, dy, dz = points[p, 0] - mx, points[p, 1] - my, points[p, 2] - mz
+        a[0, 0], a[0, 1], a[0, 2] = a[0, 0] + w * dx * dx, a[0, 1] + w * dx * dy, a[0, 2] + w * dx * dz
+        a[1, 1], a[1, 2], a[2, 2] = a[1, 1] + w * dy * dy, a[1, 2] + w * dy * dz, a[2, 2] + w * dz * dz
+    a[1, 0], a[2, 0], a[2, 1] = a[0, 1], a[0, 2], a[1, 2]
+    _, _, _, column = _eigen(a, axes)
+    return column
+
+
+@kernel("void(float64[:, ::1], int64[:, ::1], int64, float64[:, :])")
+def plane_normals(points: Floats, near: Ints, first: int, out: Floats) -> None:
+    """Normals (m, 3) of planes fitted to the neighbors, near (n, k), of points first + i."""
+    a, axes, weights = np.empty((3, 3)), np.empty((3, 3)), np.ones(near.shape[1])
+    for i in range(len(out)):
+        column = _least(points, near, first + i, near.shape[1], weights, a, axes)
+        for c in range(3):
+            out[i, c] = axes[c, column]
+
+
+@kernel("void(float64[:, ::1], float64[:, ::1], int64[:, ::1], int64, float64[::1], int64, float64[:, :])")
+def sheet_normals(points: Floats, normals: Floats, near: Ints, k: int, shape: Floats, first: int, out: Floats) -> None:
+    """`pnu.geometry.normal_estimation.sheet_weights`, sharpness and width in `shape`, and the planes fitted by them to
+    the first k neighbors of points first + i: normals (m, 3) to the side of those given."""
+    a, axes, weights = np.empty((3, 3)), np.empty((3, 3)), np.empty(k)
+    for i in range(len(out)):
+        here = first + i
+        x, y, z = points[here]
+        nx, ny, nz = normals[here]
+        far = near[here, k - 1]
+        fx, fy, fz = points[far, 0] - x, points[far, 1] - y, points[far, 2] - z
+        reach = max(np.sqrt(fx * fx + fy * fy + fz * fz), 1e-9) / 1.5
+        weights[0] = 1
+        for j in range(1, k):
+            p = near[here, j]
+            dx, dy, dz = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
+            ox, oy, oz = normals[p, 0], normals[p, 1], normals[p, 2]
+            rise = abs(dx * nx + dy * ny + dz * nz) + abs(dx * ox + dy * oy + dz * oz)
+            facing = max(nx * ox + ny * oy + nz * oz, 0.0) ** shape[0]
+            rise /= shape[1] * reach
+            weights[j] = facing * np.exp(-(dx * dx + dy * dy + dz * dz) / (reach * reach) - rise * rise)
+        column = _least(points, near, here, k, weights, a, axes)
+        cosine = axes[0, column] * nx + axes[1, column] * ny + axes[2, column] * nz
+        for c in range(3):
+            if abs(cosine) < ACROSS:
+                out[i, c] = normals[here, c]
+            else:
+                out[i, c] = axes[c, column] if cosine > 0 else -axes[c, column]
 
 
 @kernel("void(float64[:, ::1], int64[:, ::1], float64[::1], int64[::1], int64, int64, float64[:, :], float64[:, :])")

@@ -1,8 +1,9 @@
-"""Compiled fits to neighborhoods against NumPy's: the features of stray points."""
+"""Compiled fits to neighborhoods against NumPy's: normals, and the features of stray points."""
 
 import numpy as np
 import pytest
 
+from pnu.geometry.normal_estimation import estimate_normals, refit_normals
 from pnu.geometry.outlier_features import outlier_features
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -28,3 +29,22 @@ def test_features_equal_numpys(monkeypatch: pytest.MonkeyPatch, n: int, kind: st
     if kind == "line" or n == 3:  # which of its planes a line has is open: features of normals are left out
         plain, fast = plain[:, :18], fast[:, :18]
     np.testing.assert_allclose(fast, plain, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["near", "far", "plane"])
+@pytest.mark.parametrize("n", [20, 300, 2500])
+def test_normals_equal_numpys(monkeypatch: pytest.MonkeyPatch, n: int, kind: str) -> None:
+    points = cloud(kind, n)
+    fast = [estimate_normals(points, orient=False), refit_normals(points, estimate_normals(points))]
+    monkeypatch.setenv("PNU_FAST", "0")
+    plain = [estimate_normals(points, orient=False), refit_normals(points, estimate_normals(points))]
+    np.testing.assert_allclose(abs((fast[0] * plain[0]).sum(1)), 1, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(fast[1], axis=1), 1, atol=1e-5)
+    alike = (fast[1] * plain[1]).sum(1) > 1 - 1e-4  # single precision decides where the weights of two sheets are alike
+    assert alike.mean() > 0.99
+
+
+def test_normals_of_points_at_one_place_and_of_few() -> None:
+    for points in (np.zeros((40, 3)), np.eye(3), np.arange(12.0).reshape(4, 3)):
+        found = estimate_normals(points, min(len(points), 16))
+        assert np.isfinite(found).all()
