@@ -4,15 +4,16 @@
 """
 
 import os
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
 from torch import nn
 
-from pnu.fast import forms, terms
+from pnu.fast import forms
 
-FORMS: dict[type[nn.Module], type[nn.Module]] = {form.__bases__[0]: form for form in (*forms.ALL, terms.CompoundLoss)}
+LOSS = "pnu.losses.compound"
 Module = TypeVar("Module", bound=nn.Module)
 
 
@@ -24,9 +25,20 @@ def accelerate(module: Module) -> Module:
     `PNU_FAST=0` in the environment.
     """
     if os.environ.get("PNU_FAST") != "0":
+        known = fast_forms()
         for part in module.modules():
-            part.__class__ = FORMS.get(type(part), type(part))
+            part.__class__ = known.get(type(part), type(part))
     return module
+
+
+def fast_forms() -> dict[type[nn.Module], type[nn.Module]]:
+    """The fast form of each network's part, and of the loss where that is imported, as it is for training alone."""
+    found = list(forms.ALL)
+    if LOSS in sys.modules:
+        from pnu.fast import terms
+
+        found.append(terms.CompoundLoss)
+    return {form.__bases__[0]: form for form in found}
 
 
 @contextmanager

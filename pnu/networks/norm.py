@@ -3,7 +3,6 @@
 import torch
 import torch.distributed
 from torch import Tensor, nn
-from torch.distributed.nn.functional import all_reduce
 
 
 class BatchNorm(nn.BatchNorm1d):
@@ -50,6 +49,8 @@ def check_rows(count: float) -> None:
 def everywhere(sums: Tensor) -> Tensor:
     """Sums over all processes, with gradient where one is wanted."""
     if torch.is_grad_enabled() and sums.requires_grad:
+        from torch.distributed.nn.functional import all_reduce  # takes a tenth of a second
+
         with_gradient: Tensor = all_reduce(sums)
         return with_gradient
     total = sums.clone()

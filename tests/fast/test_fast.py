@@ -16,7 +16,7 @@ from torch import Tensor, nn
 import pnu
 import pnu.losses
 from pnu import networks
-from pnu.fast import FORMS, accelerate, accelerated, cache, forms
+from pnu.fast import accelerate, accelerated, cache, fast_forms, forms
 from pnu.fast.forms import through
 from pnu.fast.neighborhoods import Neighborhoods, distinct, single, whole
 from pnu.losses import CompoundLoss
@@ -334,7 +334,7 @@ def test_a_fast_part_equals_the_plain_one(name: str, clouds: int, n: int, mode: 
     with torch.set_grad_enabled(mode != "eval"):
         expected = values_of(part, lambda network: run(network, x), x)
         fast = accelerate(copy.deepcopy(part))
-        assert type(fast) is FORMS[type(part)]
+        assert type(fast) is fast_forms()[type(part)]
         found = values_of(fast, lambda network: run(network, x), x)
     # in float32 batch norm magnifies the rounding of columns that hardly vary, on each processor in another way
     assert_equal(found, expected, 1e-9 if dtype == torch.float64 else 1e-3 if mode == "training" else 1e-4)
@@ -376,7 +376,7 @@ def test_a_fast_network_equals_the_plain_one(monkeypatch: pytest.MonkeyPatch, na
     plain = networks.build_network({"_target_": f"pnu.networks.{name}", **NETWORKS[name]}).double()
     patch = torch.cat([cloud(2, 70)[..., :3], nn.functional.normalize(cloud(2, 70)[..., 3:6], dim=-1)], -1).double()
     fast = accelerate(copy.deepcopy(plain))
-    assert {type(part) for part in fast.modules()} & FORMS.keys() == set()
+    assert {type(part) for part in fast.modules()} & fast_forms().keys() == set()
 
     def everything(network: nn.Module) -> Tensor:
         return torch.cat([value.flatten() for value in network.outputs(patch).values()])
@@ -414,7 +414,7 @@ def test_training_and_inference_are_fast(monkeypatch: pytest.MonkeyPatch) -> Non
 
     module = UpsamplingModule(networks.build_network({"_target_": "pnu.networks.pnu.PNU"}), CompoundLoss())
     assert type(module.model.local_features.abstractions[0]) is forms.Abstraction
-    assert type(module.loss) is FORMS[CompoundLoss]
+    assert type(module.loss) is fast_forms()[CompoundLoss]
     used = []
     through = forms.through
     monkeypatch.setattr(
