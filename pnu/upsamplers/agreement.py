@@ -3,13 +3,24 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from pnu import kernels
+from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.point_tree import PointTree
-from pnu.runtime.threads import thread_count
+from pnu.runtime.progress import Step, silent
+from pnu.runtime.threads import map_on_threads, thread_count
 
 NEIGHBORS = 48  # predictions that a point asks: of 8 patches that overlap, some 3 spacings around
-ROUNDS = 2
-CHUNK = 2**14  # points at once: 50 MiB
+ROUNDS = 4
+SURPLUS = 1.2  # points chosen of those wanted: the farthest ones lie off the surface, and close together once on it
+CHUNK = 2**11  # points at once: 6 MiB
 Floats = NDArray[np.float64]
+
+
+def most_agreed(predicted: Floats, count: int, step: Step = silent) -> Floats:
+    """Points and unit normals (count, 6) where predictions (m, 6) agree: farthest points, `agreed`, thinned out."""
+    more = min(round(SURPLUS * count), len(predicted))
+    found = agreed(predicted[farthest_points_large(predicted[:, :3], more, step=step)], predicted)
+    return found[farthest_points_large(found[:, :3], count)]
 
 
 def agreed(chosen: Floats, predicted: Floats) -> Floats:
@@ -19,24 +30,38 @@ def agreed(chosen: Floats, predicted: Floats) -> Floats:
     between normals: first the normal, then the offset along it. So errors across the surface, which differ from patch
     to patch, cancel, and points keep their places along it. Normals of both may have any length.
     """
-    tree, sides = PointTree(predicted[:, :3]), _unit(predicted[:, 3:])
+    chosen, predicted = (np.ascontiguousarray(values, np.float64) for values in (chosen, predicted))
+    points, normals = np.ascontiguousarray(chosen[:, :3]), _unit(chosen[:, 3:])
+    places, sides = np.ascontiguousarray(predicted[:, :3]), _unit(predicted[:, 3:])
     k = min(NEIGHBORS, len(predicted))
-    out = np.empty_like(chosen)
-    for first in range(0, len(chosen), CHUNK):
-        points, normals = chosen[first : first + CHUNK, :3], _unit(chosen[first : first + CHUNK, 3:])
-        _, around = tree.nearest_sq(points, k, threads=thread_count())
-        for _ in range(ROUNDS):
-            offsets = predicted[around, :3] - points[:, None]
-            dist_sq = (offsets**2).sum(-1)
-            close = np.exp(-2 * dist_sq / np.maximum(dist_sq.max(1, keepdims=True), np.finfo(float).tiny))
-            normals = _unit(((close * _alike(sides[around], normals))[..., None] * sides[around]).sum(1))
-            weight = close * _alike(sides[around], normals)
-            along = (offsets * normals[:, None]).sum(-1)
-            total = weight.sum(1)
-            move = np.divide((weight * along).sum(1), total, out=np.zeros_like(total), where=total > 0)
-            points = points + move[:, None] * normals
-        out[first : first + CHUNK] = np.hstack([points, normals])
-    return out
+    around = PointTree(places).nearest_sq(points, k, threads=thread_count())[1]
+    found = np.empty_like(chosen)
+    work = _move_to_means
+    if kernels.ready():
+        from pnu.kernels.local_means import move_to_means as work
+    parts = [slice(first, min(first + CHUNK, len(points))) for first in range(0, len(points), CHUNK)]
+    map_on_threads(lambda part: work(points, normals, places, sides, around, ROUNDS, part.start, found[part]), parts)
+    return found
+
+
+def _move_to_means(
+    points: Floats, normals: Floats, places: Floats, sides: Floats, around: NDArray[np.int64], rounds: int, first: int,
+    out: Floats,
+) -> None:  # fmt: skip
+    """`pnu.kernels.local_means.move_to_means`."""
+    part = slice(first, first + len(out))
+    points, normals, around = points[part], normals[part], around[part]
+    for _ in range(rounds):
+        offsets = places[around] - points[:, None]
+        dist_sq = (offsets**2).sum(-1)
+        close = np.exp(-2 * dist_sq / np.maximum(dist_sq.max(1, keepdims=True), np.finfo(float).tiny))
+        normals = _unit(((close * _alike(sides[around], normals))[..., None] * sides[around]).sum(1))
+        weight = close * _alike(sides[around], normals)
+        along = (offsets * normals[:, None]).sum(-1)
+        total = weight.sum(1)
+        move = np.divide((weight * along).sum(1), total, out=np.zeros_like(total), where=total > 0)
+        points = points + move[:, None] * normals
+    out[:, :3], out[:, 3:] = points, normals
 
 
 def _alike(sides: Floats, normals: Floats) -> Floats:

@@ -14,7 +14,7 @@ from pnu.geometry.transforms import rotate, rotation_matrix
 from pnu.geometry.unit_sphere import unit_sphere_frame
 from pnu.runtime import threads
 from pnu.runtime.workers import Begin, InProcess, Work, Workers
-from pnu.upsamplers.agreement import agreed
+from pnu.upsamplers.agreement import most_agreed
 from pnu.upsamplers.context import Context
 from pnu.upsamplers.unit_normals import check_finite, with_unit_normals
 
@@ -120,10 +120,10 @@ class Patches:
         context.progress(stage, len(idx), len(idx))
         stage = f"farthest points, {count} of {len(predicted)}"
         check_finite(predicted.numpy())
-        chosen = patch_extraction.merge(predicted[None], count, partial(context.progress, stage))
-        if context.merge != "agreed" or chosen.shape[1] < 6:
-            return chosen
-        return torch.from_numpy(agreed(chosen.double().numpy(), predicted.double().numpy()))
+        if context.merge == "agreed" and predicted.shape[1] >= 6:
+            agreed = most_agreed(predicted.double().numpy(), count, partial(context.progress, stage))
+            return torch.from_numpy(agreed)
+        return patch_extraction.merge(predicted[None], count, partial(context.progress, stage))
 
 
 def predictions(network: nn.Module, places: np.ndarray, batch_size: int | None = None, turns: int = 0) -> Work:

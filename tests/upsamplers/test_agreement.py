@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 import pnu
-from pnu.upsamplers.agreement import agreed
+from pnu.geometry.farthest_sampling import farthest_points_large
+from pnu.upsamplers.agreement import agreed, most_agreed
 
 
 def plates(number: int, noise: float, seed: int = 0) -> np.ndarray:
@@ -44,6 +46,27 @@ def test_motion_and_order_of_the_predictions_change_nothing() -> None:
     turn = np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]
     moved = np.hstack([predicted[:, :3] @ turn + [1, 2, 3], predicted[:, 3:] @ turn])
     np.testing.assert_allclose(agreed(moved[:50], moved)[:, :3], found[:, :3] @ turn + [1, 2, 3], atol=1e-9)
+
+
+def test_compiled_and_plain_rounds_are_the_same(monkeypatch: pytest.MonkeyPatch, compiled: None) -> None:
+    predicted = plates(5000, 0.01)
+    predicted[:20, 3:], predicted[20:40] = 0, predicted[40:60]  # without a direction, and at one place
+    fast = agreed(predicted[:3000], predicted)
+    monkeypatch.setenv("PNU_FAST", "0")
+    np.testing.assert_allclose(agreed(predicted[:3000], predicted), fast, atol=1e-9)
+
+
+def test_farthest_points_off_the_surface_leave_no_crowds() -> None:
+    """They lie apart off it, and close together once they are on it."""
+    predicted = plates(20000, 0.02)
+
+    def closest(cloud: np.ndarray) -> np.ndarray:
+        return np.sort(cKDTree(cloud[:, :3]).query(cloud[:, :3], 2)[0][:, 1])[:20]
+
+    chosen = predicted[farthest_points_large(predicted[:, :3], 2000)]
+    found = most_agreed(predicted, 2000)
+    assert found.shape == (2000, 6)
+    assert closest(found).mean() > 2 * closest(agreed(chosen, predicted)).mean()
 
 
 @pytest.mark.parametrize("lost", [0, np.nan, np.inf])
