@@ -10,8 +10,8 @@ from pnu.runtime.progress import Step, silent
 from pnu.runtime.threads import map_on_threads, thread_count
 
 NEIGHBORS = 48  # predictions that a point asks: of 8 patches that overlap, some 3 spacings around
-ROUNDS = 4
-SURPLUS = 1.2  # points chosen of those wanted: the farthest ones lie off the surface, and close together once on it
+ROUNDS = 8
+SURPLUS = 1.1  # points chosen of those wanted: the farthest ones lie off the surface, and close together once on it
 CHUNK = 2**11  # points at once: 6 MiB
 Floats = NDArray[np.float64]
 
