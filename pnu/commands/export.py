@@ -13,10 +13,14 @@ from pnu.config.schema import doc
 class Export:
     """Write the best weights of a run, and what the network is, to one file that `run=` of other commands takes."""
 
-    run: str = doc("run folder; for onnx also the name of weights that come with pnu, such as surface")
+    run: str = doc("run folder, file of weights, or name of weights that come with pnu, such as surface")
     output: str | None = doc("file to write; null: named as the run, in the working folder")
     format: Literal["safetensors", "onnx"] | None = doc(
         "safetensors, which pnu reads, or onnx, for other runtimes; null: what output ends with"
+    )
+    coarse: str | None = doc(
+        "of surface models: run or weights of a smaller one (experiment=surface_coarse) for the steps before the last; "
+        "null: as the run has it"
     )
     allow: list[str] = doc("packages of your own whose networks a run may name; they run their code")
     quiet: bool = doc("print nothing but errors")
@@ -35,18 +39,27 @@ def export(cfg: Any) -> None:
     from pnu.networks import checkpoints
 
     network = checkpoints.load(cfg.run, cfg.allow)
-    lines = as_onnx(network, output) if ending == "onnx" else as_safetensors(network, cfg.run, output)
+    if ending == "onnx":
+        lines = as_onnx(network, output)
+    else:
+        lines = as_safetensors(network, cfg.run, output, cfg.coarse and checkpoints.load(cfg.coarse, cfg.allow))
     if not cfg.quiet:
         print(f"output: {output}, {output.stat().st_size / 1e6:.2f} MB")
         print("\n".join(lines))
 
 
-def as_safetensors(network: Any, run: str, output: Path) -> list[str]:
-    """Write a run's network; what to say about it."""
+def as_safetensors(network: Any, run: str, output: Path, coarse: Any = None) -> list[str]:
+    """Write a run's network, with another one for its coarse steps where that is given; what to say about it."""
     from pnu import weights
     from pnu.networks import checkpoints
 
-    model = checkpoints.run_config(Path(run))["model"]
+    file = weights.find(run)
+    model = checkpoints.run_config(Path(run))["model"] if file is None else weights.read(file).model
+    if coarse is not None:
+        if not hasattr(network, "with_coarse"):
+            raise ValueError(f"coarse: {type(network).__name__} has no coarse steps; leave it out")
+        network = network.with_coarse(coarse)
+        model = model | {"coarse": network.coarse_width}
     weights.write(output, model, network.state_dict(), getattr(network, "patch_size", None))
     return [f"next:   {shell_line('upsample', run=output, input='cloud.ply', output='dense.ply')}"]
 

@@ -13,8 +13,8 @@ from pnu.config.schema import doc
 from pnu.runtime.progress import busy, stages
 
 QUALITIES: dict[str, dict[str, float]] = {
-    "best": {},
-    "fast": {"seeds": 2, "candidates": 1.3, "shortlist": 1.0, "relaxation": 1, "refinements": 1},
+    "best": {"fine": 9},  # all steps by the network itself
+    "fast": {"seeds": 2, "candidates": 1.3, "shortlist": 1.0, "relaxation": 1, "refinements": 1, "fine": 1},
 }  # how the surface network is used, see `pnu.networks.surface.Surface`
 
 

@@ -23,8 +23,9 @@ class ProjectionDataModule(EpochDataModule):
         scans: share of the clouds that are simulated scans
         blue: share of the other clouds whose points keep a distance, as blue noise
         least: points of the smallest clouds
-        noise: largest standard deviation, in radii, of the noise of clouds whose normals are estimated
-        noisy: share of these clouds that has noise
+        noise: largest standard deviation of the noise, in radii
+        noisy: share of the clouds that has noise
+        given: share of the crops that has given normals where they are mixed
         clouds: of an epoch, each drawn anew
         pool: clouds that are drawn at all, and used again and again; null: as many as are used
         size: points of a crop
@@ -42,8 +43,8 @@ class ProjectionDataModule(EpochDataModule):
         self, root: str | None = None, procedural: bool = True, validation: Iterable[str] = (),
         normals: Literal["given", "estimated", "mixed"] = "given", sides: Literal["truth", "found"] = "truth",
         scans: float = 0.0, blue: float = 0.15, least: int = LEAST,
-        noise: float = 0.02, noisy: float = 0.5, clouds: int = 6400, pool: int | None = None, size: int = 384,
-        views: int = 2, batch_size: int = 8, points: int = 2048, workers: int = 0, seed: int = 0,
+        noise: float = 0.02, noisy: float = 0.5, given: float = 0.3, clouds: int = 6400, pool: int | None = None,
+        size: int = 384, views: int = 2, batch_size: int = 8, points: int = 2048, workers: int = 0, seed: int = 0,
     ) -> None:  # fmt: skip
         super().__init__(batch_size, workers, seed)
         if points < SMALLEST:
@@ -51,7 +52,7 @@ class ProjectionDataModule(EpochDataModule):
         self.evaluation_batch_size = 1
         self.root, self.procedural, self.held_out = root, procedural, list(validation)
         self.scans, self.blue, self.least, self.noise, self.noisy = scans, blue, least, noise, noisy
-        self.sides, self.pool = sides, pool
+        self.sides, self.given, self.pool = sides, given, pool
         self.normals, self.clouds, self.size, self.views, self.points = normals, clouds, size, views, points
         self.truth: MeshScene | None = None
 
@@ -90,6 +91,7 @@ class ProjectionDataModule(EpochDataModule):
             least=self.least,
             noise=self.noise,
             noisy=self.noisy,
+            given=self.given,
             seed=self.seed,
         )
         clouds = {

@@ -21,8 +21,8 @@ USUAL = (1500, 6500)  # and for the other half
 SMALLEST = 16  # points of a crop, or of a cloud for validation, from which surfaces can be told
 TAKEN = 0.015  # distance from the surface up to which a point of a scan is taken for a measurement of it,
 OVERLOOKED = 0.03  # and the share of the others that stay, as where they are removed by their looks
-GIVEN = 0.3  # share of the crops that have true normals where normals="mixed"
 UNEVEN = 0.2  # share of the clouds
+OFF = 0.15  # share of those with given normals in which these are a little off
 HARD, WRONG = 1 / 3, 0.9  # share of the crops around points whose cosine with the true normal is below the second
 
 
@@ -39,11 +39,11 @@ class Crops(Dataset[dict[str, Any]]):
     """`length` random clouds, each in `views` crops: the `size` points around one of its points, nearest first.
 
     A cloud has `least` to 8000 points, drawn at random, unevenly (20 %), or as blue noise (a share `blue`). With
-    normals="given" they are true, in 15 % of the clouds a little off, and 20 % of the clouds have up to 1 % noise; with
-    "estimated" they come from the cloud, with the true side, and a share `noisy` of the clouds has noise up to `noise`
-    (Gaussian, standard deviation in units of the shape's radius); "mixed": estimated in 70 % of the crops. Inside and
-    outside are swapped in 30 %. A share `scans` of the clouds are simulated scans (`pnu.data.scanner`), most strays
-    removed and lines thinned out, as `pnu.upsample` does before the network sees them.
+    normals="given" they are true, in 15 % of the clouds a little off; with "estimated" they come from the cloud, with
+    the true side; "mixed": given in a share `given` of the crops. A share `noisy` of the clouds has noise up to `noise`
+    (Gaussian, standard deviation in units of the shape's radius). Inside and outside are swapped in 30 %. A share
+    `scans` of the clouds are simulated scans (`pnu.data.scanner`), most strays removed and lines thinned out, as
+    `pnu.upsample` does before the network sees them.
 
     The sides of estimated normals are the true ones, or with sides="found" those that `settled_normals` chooses, where
     a third of the crops is around points whose normals come out wrong. With a `pool` so many clouds are drawn and used
@@ -57,7 +57,7 @@ class Crops(Dataset[dict[str, Any]]):
     def __init__(
         self, meshes: dict[str, Mesh], length: int, *, size: int = 384, views: int = 2, normals: str = "given",
         sides: str = "truth", scans: float = 0.0, blue: float = 0.15, least: int = LEAST, noise: float = 0.02,
-        noisy: float = 0.5, pool: int | None = None, seed: int = 0,
+        noisy: float = 0.5, given: float = 0.3, pool: int | None = None, seed: int = 0,
     ) -> None:  # fmt: skip
         if normals not in ("given", "estimated", "mixed"):
             raise ValueError(f"data.normals={normals}: expected given, estimated or mixed")
@@ -73,6 +73,8 @@ class Crops(Dataset[dict[str, Any]]):
             raise ValueError(f"data.noise={noise}: expected a standard deviation from 0 to 0.1 radii")
         if not 0 <= noisy <= 1:
             raise ValueError(f"data.noisy={noisy}: expected a share from 0 to 1")
+        if not 0 <= given <= 1:
+            raise ValueError(f"data.given={given}: expected a share from 0 to 1")
         if not SMALLEST <= least <= USUAL[0]:
             raise ValueError(f"data.least={least}: expected {SMALLEST} to {USUAL[0]} points")
         if not SMALLEST <= size <= least:
@@ -85,7 +87,8 @@ class Crops(Dataset[dict[str, Any]]):
         self.length, self.size, self.views, self.blue, self.least = length, size, views, blue, least
         self.noise, self.noisy, self.found_sides, self.pool = noise, noisy, sides == "found", pool
         self.drawn: dict[int, Drawn] = {}
-        self.estimated, self.mixed, self.scans, self.seed = normals != "given", normals == "mixed", scans, seed
+        self.estimated, self.given = normals != "given", given if normals == "mixed" else 0.0
+        self.scans, self.seed = scans, seed
         self.scanners = [Scanner(mesh) for mesh in self.meshes]
 
     def __len__(self) -> int:
@@ -135,7 +138,7 @@ class Crops(Dataset[dict[str, Any]]):
         distance = np.linalg.norm(noisy[:, :3] - center, axis=1)
         near = np.argpartition(distance, self.size - 1)[: self.size]
         near = near[np.argsort(distance[near])]
-        true = self.mixed and rng.random() < GIVEN
+        true = self.given > 0 and rng.random() < self.given
         normals = noisy[near, 3:] if true else rough[near]
         side = -1.0 if rng.random() < 0.3 else 1.0
         if self.found_sides:
@@ -177,10 +180,10 @@ class Crops(Dataset[dict[str, Any]]):
         else:
             clean = uneven(sample_area(mesh, 4 * n, rng), n, rng)
         noisy = clean.copy()
-        if rng.random() < (self.noisy if self.estimated else 0.2):
-            sigma = rng.uniform(0, rng.choice([0.3, 1]) * self.noise if self.estimated else 0.01)
+        if rng.random() < self.noisy:
+            sigma = rng.uniform(0, rng.choice([0.3, 1]) * self.noise)
             noisy[:, :3] += sigma * rng.standard_normal((n, 3))
-        if not self.estimated and rng.random() < 0.15:
+        if (self.given or not self.estimated) and rng.random() < OFF:
             noisy[:, 3:] += rng.uniform(0, 0.15) * rng.standard_normal((n, 3))
             noisy[:, 3:] /= np.linalg.norm(noisy[:, 3:], axis=1, keepdims=True)
         return clean, noisy

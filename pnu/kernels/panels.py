@@ -15,14 +15,20 @@ def _lanes() -> int:
 LANES = _lanes()  # float32 that the processor computes with at once
 VECTORS = 4 if LANES == 16 else 2  # beside each other: 32 registers, or 16
 PANEL = VECTORS * LANES
+NARROW = 2 * LANES  # a panel of networks no wider than that
+
+
+def panel_of(width: int) -> int:
+    """Columns of the panels of a network."""
+    return NARROW if width <= NARROW else PANEL
 
 
 def padded(width: int) -> int:
     """Columns that as many fill up to whole panels."""
-    return -(-width // PANEL) * PANEL
+    return -(-width // panel_of(width)) * panel_of(width)
 
 
-def pack(matrix: NDArray[np.float32], columns: int = PANEL) -> NDArray[np.float32]:
+def pack(matrix: NDArray[np.float32], columns: int) -> NDArray[np.float32]:
     """A matrix (depth, width) as flat panels; its width is a multiple of `columns`."""
     depth, width = matrix.shape
     panels = matrix.reshape(depth, width // columns, columns).transpose(1, 0, 2)

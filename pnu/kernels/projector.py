@@ -6,7 +6,7 @@ multiple of the rows of a tile, so that a tile belongs to one query. Exponential
 is in the weights.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,15 +28,30 @@ from pnu.kernels.frames import (
     gather_block,
     make_frames,
 )
-from pnu.kernels.panels import LANES, PANEL, VECTORS, pack, padded
+from pnu.kernels.panels import LANES, NARROW, PANEL, VECTORS, pack, padded, panel_of
 
 if by_numba():  # kept machine code has them inside
     from pnu.kernels.tiles import FEW_ROWS, ROWS, tile
     from pnu.kernels.vectors import full, fused, largest, load_vector, power_of_two, store_vector, sum_of_lanes
 
-    _first = tile(FEW_ROWS, VECTORS, relu=True)
-    _layer, _logits = tile(ROWS, VECTORS, relu=True), tile(ROWS, VECTORS, relu=False)
-    _head, _context = tile(FEW_ROWS, VECTORS, relu=True), tile(FEW_ROWS, VECTORS, relu=False)
+    def _tile(rows: int, *, relu: bool) -> Any:
+        """A tile of either width, NARROW or PANEL columns, as its first argument says."""
+        narrow, wide = tile(rows, NARROW // LANES, relu=relu), tile(rows, VECTORS, relu=relu)
+
+        @kernel(inner=True)
+        def product(
+            columns: int, x: Any, x_at: int, x_row: int, x_column: int, w: Any, w_at: int, depth: int,
+            start: Any, start_at: int, out: Any, out_at: int, out_row: int,
+        ) -> None:  # fmt: skip
+            if columns == NARROW:
+                narrow(x, x_at, x_row, x_column, w, w_at, depth, start, start_at, out, out_at, out_row)
+            else:
+                wide(x, x_at, x_row, x_column, w, w_at, depth, start, start_at, out, out_at, out_row)
+
+        return product
+
+    _first, _layer, _logits = _tile(FEW_ROWS, relu=True), _tile(ROWS, relu=True), _tile(ROWS, relu=False)
+    _head, _context = _tile(FEW_ROWS, relu=True), _tile(FEW_ROWS, relu=False)
     _out = tile(FEW_ROWS, 1, relu=False)
 
 OUT = 7  # numbers: position, normal, logarithm of the error
@@ -69,7 +84,7 @@ class PackedWeights(NamedTuple):
 def packed(parameters: dict[str, NDArray[np.float32]], *, attention: bool) -> PackedWeights:
     """PackedWeights of a projector by the names of its state dict; without attention all neighbors count alike."""
     width = len(parameters["first.bias"])
-    wide = padded(width)
+    wide, panel = padded(width), panel_of(width)
 
     def blocks(matrix: NDArray[np.float32], rows: list[int], columns: int) -> NDArray[np.float32]:
         """Transposed, with blocks of `width` rows and `rows` places for each of them, filled up to `columns`."""
@@ -93,12 +108,12 @@ def packed(parameters: dict[str, NDArray[np.float32]], *, attention: bool) -> Pa
     scale = LOG2_E if attention else f32(0)
     of_features, choices = np.split(parameters["attention.weight"] * scale, [width])
     return PackedWeights(
-        pack(blocks(parameters["first.weight"], [FEATURES], wide)), bias("first.bias", wide),
-        pack(blocks(parameters["second.weight"], [wide], wide)), bias("second.bias", wide),
-        pack(blocks(parameters["context.weight"], [wide, wide, 1], wide)), bias("context.bias", wide),
-        pack(blocks(parameters["third.weight"], [wide], wide)), bias("third.bias", wide),
-        pack(blocks(of_features, [wide], wide)), blocks(choices, [wide], 2).T.ravel().copy(),
-        pack(of_head), bias("head.0.bias", 2 * wide), pack(last), bias("head.2.bias", wide),
+        pack(blocks(parameters["first.weight"], [FEATURES], wide), panel), bias("first.bias", wide),
+        pack(blocks(parameters["second.weight"], [wide], wide), panel), bias("second.bias", wide),
+        pack(blocks(parameters["context.weight"], [wide, wide, 1], wide), panel), bias("context.bias", wide),
+        pack(blocks(parameters["third.weight"], [wide], wide), panel), bias("third.bias", wide),
+        pack(blocks(of_features, [wide], wide), panel), blocks(choices, [wide], 2).T.ravel().copy(),
+        pack(of_head, panel), bias("head.0.bias", 2 * wide), pack(last, panel), bias("head.2.bias", wide),
         pack(blocks(parameters["out.weight"], [wide], LANES), LANES), bias("out.bias", LANES),
     )  # fmt: skip
 
@@ -189,6 +204,7 @@ def project_queries(
     """Queries (m, 6) and their neighbors idx (m, k) of a cloud (n, 6), by `PackedWeights` -> result (m, 7): points,
     normals, and the logarithm of the expected error."""
     k, wide = idx.shape[1], len(first_bias)
+    panel = NARROW if wide <= NARROW else PANEL
     rows = (k + ROWS - 1) // ROWS * ROWS  # of a query
     scale = f32(0)
     for weight in attention:
@@ -213,34 +229,39 @@ def project_queries(
         make_frames(near, hint, k, sphere, work, frame, features)
         for i in range(k):
             for q in range(0, LANES, FEW_ROWS):
-                for p in range(0, wide, PANEL):
+                for p in range(0, wide, panel):
                     _first(
-                        features, i * FEATURES * LANES + q, 1, LANES, first, p * FEATURES, FEATURES,
+                        panel, features, i * FEATURES * LANES + q, 1, LANES, first, p * FEATURES, FEATURES,
                         first_bias, p, below, (q * rows + i) * wide + p, rows * wide,
                     )  # fmt: skip
-        for p in range(0, wide, PANEL):
+        for p in range(0, wide, panel):
             for r in range(0, LANES * rows, ROWS):
                 _layer(
-                    below, r * wide, wide, 1, second, p * wide, wide, second_bias, p, middle, r * wide + p, wide
+                    panel, below, r * wide, wide, 1, second, p * wide, wide, second_bias, p, middle, r * wide + p, wide
                 )  # fmt: skip
         for q in range(LANES):
             _pool(middle, scale, middle, q * rows * wide, k, wide, pooled, q * pooled_wide)
             pooled[q * pooled_wide + 2 * wide] = frame[HEIGHT * LANES + q]
-        for p in range(0, wide, PANEL):
+        for p in range(0, wide, panel):
             for q in range(0, LANES, FEW_ROWS):
                 _context(
-                    pooled, q * pooled_wide, pooled_wide, 1, context, p * pooled_wide, pooled_wide,
+                    panel, pooled, q * pooled_wide, pooled_wide, 1, context, p * pooled_wide, pooled_wide,
                     context_bias, p, contexts, q * wide + p, wide,
                 )  # fmt: skip
         for q in range(LANES):
             for c in range(0, wide, LANES):
                 store_vector(start_third, c, load_vector(contexts, q * wide + c) + load_vector(third_bias, c))
-            for p in range(0, wide, PANEL):
+            for p in range(0, wide, panel):
                 for r in range(q * rows, (q + 1) * rows, ROWS):
-                    _layer(middle, r * wide, wide, 1, third, p * wide, wide, start_third, p, above, r * wide + p, wide)
-        for p in range(0, wide, PANEL):
+                    _layer(
+                        panel, middle, r * wide, wide, 1, third, p * wide, wide, start_third, p,
+                        above, r * wide + p, wide,
+                    )  # fmt: skip
+        for p in range(0, wide, panel):
             for r in range(0, LANES * rows, ROWS):
-                _logits(above, r * wide, wide, 1, attention, p * wide, wide, nothing, p, logits, r * wide + p, wide)
+                _logits(
+                    panel, above, r * wide, wide, 1, attention, p * wide, wide, nothing, p, logits, r * wide + p, wide
+                )
         for q in range(LANES):
             _pool(logits, f32(1), above, q * rows * wide, k, wide, seen, q * seen_wide)
             for c in range(0, wide, LANES):
@@ -248,16 +269,16 @@ def project_queries(
             _chosen(above, q * rows * wide, choices, k, wide, shares)
             for i in range(len(shares)):
                 chosen[q, i] = shares[i]
-        for p in range(0, 2 * wide, PANEL):
+        for p in range(0, 2 * wide, panel):
             for q in range(0, LANES, FEW_ROWS):
                 _head(
-                    seen, q * seen_wide, seen_wide, 1, head, p * seen_wide, seen_wide,
+                    panel, seen, q * seen_wide, seen_wide, 1, head, p * seen_wide, seen_wide,
                     head_bias, p, head_rows, q * 2 * wide + p, 2 * wide,
                 )  # fmt: skip
-        for p in range(0, wide, PANEL):
+        for p in range(0, wide, panel):
             for q in range(0, LANES, FEW_ROWS):
                 _head(
-                    head_rows, q * 2 * wide, 2 * wide, 1, last, p * 2 * wide, 2 * wide,
+                    panel, head_rows, q * 2 * wide, 2 * wide, 1, last, p * 2 * wide, 2 * wide,
                     last_bias, p, last_rows, q * wide + p, wide,
                 )  # fmt: skip
         for q in range(0, LANES, FEW_ROWS):

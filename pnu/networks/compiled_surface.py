@@ -23,12 +23,13 @@ WIDTHS = {  # layers: rows and columns of their weights, in widths of the networ
     "first": (1, 0, 11), "second": (1, 1, 0), "context": (1, 2, 1), "third": (1, 1, 0),
     "head.0": (2, 3, 0), "head.2": (1, 2, 0), "out": (0, 1, 0),
 }  # fmt: skip
-OUT, PREFIX = 7, "projector."
+OUT, PREFIX, COARSE = 7, "projector.", "coarse."
+NEAREST = 16  # points that a coarse network looks at
 SETTINGS = (
     "ratio", "neighbors", "reach", "seeds", "candidates", "shortlist", "relaxation", "refinements", "reject", "slide",
-    "passes", "sphere", "attention",
+    "passes", "sphere", "attention", "fine",
 )  # fmt: skip
-TRAINING = ("width", "rounds", "queries", "smoothing", "refining")  # that nothing here depends on
+TRAINING = ("width", "rounds", "queries", "smoothing", "refining", "coarse")  # that nothing here depends on
 
 
 class CompiledSurface:
@@ -37,6 +38,7 @@ class CompiledSurface:
     Args:
         settings: those of SETTINGS by name.
         parameters: of its projector, float32, by the names of its state dict.
+        coarse: the smaller network of its first projections, where it has one.
     """
 
     predicts_normals = True
@@ -54,10 +56,14 @@ class CompiledSurface:
     passes: int
     sphere: bool
     attention: bool
+    fine: int
 
-    def __init__(self, settings: Mapping[str, Any], parameters: Mapping[str, NDArray[np.float32]]) -> None:
+    def __init__(
+        self, settings: Mapping[str, Any], parameters: Mapping[str, NDArray[np.float32]],
+        coarse: CompiledSurface | None = None,
+    ) -> None:  # fmt: skip
         vars(self).update({name: settings[name] for name in SETTINGS})
-        self.parameters = dict(parameters)
+        self.parameters, self.coarse = dict(parameters), coarse
         self.step: Project | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -65,7 +71,8 @@ class CompiledSurface:
 
     def state_dict(self) -> dict[str, NDArray[np.float32]]:
         """The parameters by name."""
-        return self.parameters
+        coarse = self.coarse.parameters if self.coarse is not None else {}
+        return self.parameters | {f"{COARSE}{name}": value for name, value in coarse.items()}
 
     def ranks(self, n: int) -> list[int]:
         """Ranks of the neighbors that are looked at, of those that a cloud of n points has."""
@@ -134,22 +141,29 @@ def read_compiled(source: str | PathLike[str]) -> CompiledSurface | None:
     except (ValueError, TypeError):  # types that NumPy has not, say
         return None
     settings = {key.replace("neighbour", "neighbor"): value for key, value in found.model.items()}
-    settings = {"passes": 0, "slide": 1} | settings
-    parameters = {name.removeprefix(PREFIX): value for name, value in found.state.items() if name.startswith(PREFIX)}
+    settings = {"passes": 0, "slide": 1, "fine": 1} | settings
+    parameters, of_coarse = (_parts(found.state, prefix) for prefix in (PREFIX, COARSE + PREFIX))
     target = present_name(str(settings.pop("_target_", "")))
     fits = target == TARGET and {*SETTINGS} <= {*settings} <= {*SETTINGS, *TRAINING}
-    single = all(value.dtype == np.float32 for value in parameters.values())
-    whole = len(found.state) == len(parameters)
-    if not (fits and single and whole and is_known(parameters) and _sound(settings)):
+    single = all(value.dtype == np.float32 for value in found.state.values())
+    whole = len(found.state) == len(parameters) + len(of_coarse)
+    known = is_known(parameters) and (is_known(of_coarse) if settings.get("coarse") else not of_coarse)
+    if not (fits and single and whole and known and _sound(settings)):
         return None
-    return CompiledSurface(settings, parameters)
+    few = settings | {"neighbors": NEAREST, "reach": NEAREST}
+    return CompiledSurface(settings, parameters, CompiledSurface(few, of_coarse) if of_coarse else None)
+
+
+def _parts(state: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+    """The parameters whose names begin so, by what follows."""
+    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
 
 
 def _sound(settings: Mapping[str, Any]) -> bool:
     """Whether the network takes these settings; what it does not, it says itself."""
     by_case = {name for name in ("candidates", "shortlist") if settings[name] is None}
     numbers = all(isinstance(settings[name], int | float) for name in {*SETTINGS} - by_case)
-    one = {"seeds", "candidates", "shortlist", "refinements"} - by_case
+    one = {"seeds", "candidates", "shortlist", "refinements", "fine"} - by_case
     return (
         numbers
         and 4 <= settings["neighbors"] <= settings["reach"]

@@ -5,6 +5,8 @@ sphere gives a first foot and normal; a small network shared by all neighbors, w
 corrects both. How clouds become dense with it, is in `pnu.upsamplers.surface_projection`.
 """
 
+import copy
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -16,6 +18,7 @@ from pnu.geometry.neighbor_features import gather
 from pnu.geometry.neighbor_ranks import neighbor_ranks
 from pnu.geometry.neighbor_search import knn
 from pnu.geometry.sampling import farthest_points
+from pnu.networks.compiled_surface import NEAREST
 
 EACH = 3  # seeds of a point, in training, before they are thinned out
 PUSH = 0.1  # between rounds of training, beside the way from its point to a seed
@@ -97,6 +100,9 @@ class Surface(nn.Module):
         passes: at work, times that the normals of the cloud are replaced by those that the network finds at its points
         sphere: start from the sphere that fits the neighbors (algebraic point set surface), not from the seed
         attention: weigh the neighbors; without it all count alike
+        coarse: width of a smaller network that sees the 16 nearest points and at work makes the first projections, in a
+            fraction of the time; 0: none
+        fine: the last projections, so many, by the network itself, where there is a coarse one
     """
 
     predicts_normals = True
@@ -108,7 +114,7 @@ class Surface(nn.Module):
         seeds: float = 4, candidates: float | None = None, shortlist: float | None = None,
         relaxation: int = 2, refinements: int = 2, reject: float = 0.003, slide: float = 1.0,
         queries: int = 64, smoothing: float = 0.0, refining: float = 0.0, passes: int = 0,
-        sphere: bool = True, attention: bool = True,
+        sphere: bool = True, attention: bool = True, coarse: int = 0, fine: int = 1,
     ) -> None:  # fmt: skip
         super().__init__()
         self.ratio, self.neighbors, self.reach, self.rounds = ratio, neighbors, reach, rounds
@@ -118,17 +124,42 @@ class Surface(nn.Module):
             raise ValueError(f"model.reach={reach}: expected at least model.neighbors={neighbors}, which is at least 4")
         if reject < 0:
             raise ValueError(f"model.reject={reject}: expected a share of the points, 0 or more")
-        for name in ("rounds", "seeds", "candidates", "shortlist", "refinements", "queries"):
+        self.fine = fine
+        for name in ("rounds", "seeds", "candidates", "shortlist", "refinements", "queries", "fine"):
             number = getattr(self, name)
             if number is not None and number < 1:  # too few seeds would be too few points
                 raise ValueError(f"model.{name}={number}: expected at least 1")
         for name, share in (("smoothing", smoothing), ("refining", refining), ("slide", slide)):
             if not 0 <= share <= 1:
                 raise ValueError(f"model.{name}={share}: expected a share from 0 to 1")
-        if passes < 0:
-            raise ValueError(f"model.passes={passes}: expected 0 or more")
+        for name, count in (("passes", passes), ("coarse", coarse)):
+            if count < 0:
+                raise ValueError(f"model.{name}={count}: expected 0 or more")
         self.smoothing, self.refining, self.passes, self.slide = smoothing, refining, passes, slide
         self.projector = Projector(width, sphere=sphere, attention=attention)
+        self.coarse: Surface | None = None
+        if coarse:
+            few = {"neighbors": NEAREST, "reach": NEAREST, "rounds": rounds, "width": coarse}
+            self.coarse = Surface(ratio, **few, sphere=sphere, attention=attention)
+
+    @property
+    def coarse_width(self) -> int:
+        """That of the network for the coarse steps; 0 where there is none."""
+        return 0 if self.coarse is None else self.coarse.projector.out.in_features
+
+    def with_coarse(self, coarse: nn.Module) -> "Surface":
+        """The same network with a surface model of NEAREST neighbors for its coarse steps; ValueError if it is none."""
+        if not isinstance(coarse, Surface) or (coarse.neighbors, coarse.reach) != (NEAREST, NEAREST):
+            raise ValueError(
+                f"coarse: expected a surface model with neighbors and reach of {NEAREST}, found another one"
+            )
+        mine, its = self.projector, coarse.projector
+        if (its.sphere, its.attend) != (mine.sphere, mine.attend):
+            raise ValueError("coarse: expected a surface model with the same sphere and attention, found others")
+        joined = copy.copy(self)
+        joined._modules = dict(self._modules)
+        joined.coarse = coarse
+        return joined
 
     def check_input(self, key: str, points: int) -> None:
         """`ValueError` where training inputs of so many points, set by `key`, have no room for the queries."""
@@ -142,15 +173,18 @@ class Surface(nn.Module):
         """Training: a seed for each of the first `queries` points of patches (B, n, 6), projected `rounds` times.
 
         "query" and "projected" (rounds, B, queries, 6) before and after each round, "log_error" and "spacing"
-        (rounds, B, queries); "prediction" is the last of "projected". A query has no gradient.
+        (rounds, B, queries), those of a coarse network before the others; "prediction" is the last of "projected". A
+        query has no gradient.
         """
         patch = self.with_some_smoothed(self.with_some_refined(patch))
         query, outward = self.training_seeds(patch)
         found: list[tuple[Tensor, ...]] = []
-        for _ in range(self.rounds):
-            projected, log_error, spacing = self.project(query, patch)
-            found.append((query, projected, log_error, spacing))
-            query = projected.detach() + outward
+        for network in (self.coarse, self) if self.coarse is not None else (self,):
+            place = query
+            for _ in range(self.rounds):
+                projected, log_error, spacing = network.project(place, patch)
+                found.append((place, projected, log_error, spacing))
+                place = projected.detach() + outward
         names = ("query", "projected", "log_error", "spacing")
         outputs = dict(zip(names, (torch.stack(values) for values in zip(*found, strict=True)), strict=True))
         return outputs | {"prediction": outputs["projected"][-1]}

@@ -127,12 +127,13 @@ class SurfaceProjection:
             to_sphere = partial(spheres, batch_size=context.batch_size)
             query, _ = in_parts(to_sphere, query, cloud, workers=in_process, context=context, stage="spheres")
         query = named("shortlist", lambda step: thin_between(query, some, kept, step))
-        query, error = self.projected(query, cloud, context, "projection")
+        steps = [projections if left < network.fine else coarsely for left in range(network.refinements, -1, -1)]
+        query, error = self.projected(query, cloud, context, "projection", steps[0])
         query = named("thinning", lambda step: thin_between(query, more, kept, step))
         if network.relaxation:
             query = named("even spacing", lambda step: even_out(query, network.relaxation, step, kept))
-        for i in range(network.refinements):
-            refined, error = self.projected(query, cloud, context, f"refinement {i + 1}")
+        for i in range(1, network.refinements + 1):
+            refined, error = self.projected(query, cloud, context, f"refinement {i}", steps[i])
             query = slid(query, refined, network.slide)
         query = query[reject_worst(query[:, :3], error, new)]
         if first == len(cloud):  # of a part others make what lies at its borders
@@ -153,9 +154,11 @@ class SurfaceProjection:
             query[rows], _ = self.projected(moved, cloud, context, f"places without points, {number}")
         return query
 
-    def projected(self, query: Floats, cloud: Floats, context: Context, stage: str) -> tuple[Floats, Floats]:
+    def projected(
+        self, query: Floats, cloud: Floats, context: Context, stage: str, begin: Callable[..., Work] | None = None
+    ) -> tuple[Floats, Floats]:
         """Queries (m, 6) on the surface of a cloud (n, 6), and the logarithm of their expected error (m,)."""
-        project = partial(projections, batch_size=context.batch_size)
+        project = partial(begin or projections, batch_size=context.batch_size)
         return in_parts(
             project, query, cloud, workers=context.workers or InProcess(self.network), context=context, stage=stage
         )
@@ -226,6 +229,11 @@ def projections(network: Any, cloud: Floats, batch_size: int | None = None) -> W
         return project(query, cloud, idx[:, ranks] if len(ranks) < idx.shape[1] else idx)
 
     return by_neighbors(chosen, cloud, network.reach, batch_size)
+
+
+def coarsely(network: Any, cloud: Floats, batch_size: int | None = None) -> Work:
+    """As `projections`, by the smaller network for the first of them, where there is one."""
+    return projections(network if network.coarse is None else network.coarse, cloud, batch_size)
 
 
 def spheres(network: Any, cloud: Floats, batch_size: int | None = None) -> Work:

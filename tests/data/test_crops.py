@@ -82,10 +82,31 @@ def test_crops_repeat_and_lie_near_their_surface(meshes: dict[str, Mesh], normal
 
 
 def test_some_crops_are_noisy_and_some_are_turned_inside_out(meshes: dict[str, Mesh]) -> None:
-    items = [Crops(meshes, 60, size=64, views=1)[0, index] for index in range(60)]
+    items = [Crops(meshes, 60, size=64, views=1, noisy=0.2)[0, index] for index in range(60)]
     moved = [float((i["input"] - i["target"])[..., :3].abs().max()) for i in items]
     assert 0 < sum(m > 1e-6 for m in moved) < 30
     assert 0 < sum(bool((i["side"] < 0).any()) for i in items) < 40
+
+
+def test_noise_is_as_large_and_as_frequent_as_asked(meshes: dict[str, Mesh]) -> None:
+    """With given normals as with estimated ones."""
+    for normals in ("given", "mixed"):
+        quiet = Crops(meshes, 6, size=64, views=1, normals=normals, noisy=0)
+        loud = Crops(meshes, 6, size=64, views=1, normals=normals, noisy=1, noise=0.05)
+        for index in range(6):
+            still, moved = ((item["input"] - item["target"])[..., :3] for item in (quiet[0, index], loud[0, index]))
+            assert abs(still).max() == 0
+            assert 0 < moved.std() < 0.06
+
+
+def test_mixed_normals_are_given_in_the_share_asked(meshes: dict[str, Mesh]) -> None:
+    def wrong(given: float) -> list[float]:
+        crops = Crops(meshes, 8, size=64, views=2, normals="mixed", given=given, noisy=1, noise=0.05)
+        items = [crops[0, index] for index in range(8)]
+        return [float(abs(i["input"] - i["target"])[..., 3:].mean(2).max()) for i in items]
+
+    assert np.median(wrong(1.0)) < 1e-6  # a few are a little off
+    assert np.median(wrong(0.0)) > 0.1
 
 
 def test_clouds_of_a_pool_are_used_again_in_other_crops(meshes: dict[str, Mesh]) -> None:
