@@ -77,7 +77,7 @@ def test_parts_of_another_task_are_not_taken(tmp_path: Path) -> None:
 def test_parts_of_a_network_with_other_options_are_not_taken(tmp_path: Path) -> None:
     points = sphere(300)
     for sphere_first in (True, False):
-        network = Surface(sphere=sphere_first)
+        network = Surface(sphere=sphere_first, coarse=32)
         network.load_state_dict(load("surface").state_dict())
         found = upsample(points, points, model=network, parts=tmp_path)
         np.testing.assert_array_equal(found, upsample(points, points, model=network))
