@@ -12,7 +12,8 @@ from pnu.runtime.threads import map_on_threads, thread_count
 NEIGHBORS = 48  # predictions that a point asks: of 8 patches that overlap, some 3 spacings around
 ROUNDS = 8
 SURPLUS = 1.1  # points chosen of those wanted: the farthest ones lie off the surface, and close together once on it
-CHUNK = 2**11  # points at once: 6 MiB
+KEPT = 2**17  # points whose neighbors are known at once: 50 MiB,
+CHUNK = 2**11  # and so many by a thread
 Floats = NDArray[np.float64]
 
 
@@ -30,18 +31,24 @@ def agreed(chosen: Floats, predicted: Floats) -> Floats:
     between normals: first the normal, then the offset along it. So errors across the surface, which differ from patch
     to patch, cancel, and points keep their places along it. Normals of both may have any length.
     """
-    chosen, predicted = (np.ascontiguousarray(values, np.float64) for values in (chosen, predicted))
+    places, sides = np.ascontiguousarray(predicted[:, :3], np.float64), _unit(predicted[:, 3:].astype(np.float64))
+    tree, k = PointTree(places), min(NEIGHBORS, len(predicted))
+    found = np.empty(chosen.shape)
+    for first in range(0, len(chosen), KEPT):
+        part = slice(first, first + KEPT)
+        _move_on_threads(chosen[part].astype(np.float64), places, sides, tree, k, found[part])
+    return found
+
+
+def _move_on_threads(chosen: Floats, places: Floats, sides: Floats, tree: PointTree, k: int, found: Floats) -> None:
+    """`agreed` of some points (n, 6), into `found`."""
     points, normals = np.ascontiguousarray(chosen[:, :3]), _unit(chosen[:, 3:])
-    places, sides = np.ascontiguousarray(predicted[:, :3]), _unit(predicted[:, 3:])
-    k = min(NEIGHBORS, len(predicted))
-    around = PointTree(places).nearest_sq(points, k, threads=thread_count())[1]
-    found = np.empty_like(chosen)
+    around = tree.nearest_sq(points, k, threads=thread_count())[1]
     work = _move_to_means
     if kernels.ready():
         from pnu.kernels.local_means import move_to_means as work
     parts = [slice(first, min(first + CHUNK, len(points))) for first in range(0, len(points), CHUNK)]
     map_on_threads(lambda part: work(points, normals, places, sides, around, ROUNDS, part.start, found[part]), parts)
-    return found
 
 
 def _move_to_means(

@@ -52,6 +52,8 @@ def test_compiled_and_plain_rounds_are_the_same(monkeypatch: pytest.MonkeyPatch,
     predicted = plates(5000, 0.01)
     predicted[:20, 3:], predicted[20:40] = 0, predicted[40:60]  # without a direction, and at one place
     fast = agreed(predicted[:3000], predicted)
+    monkeypatch.setattr("pnu.upsamplers.agreement.KEPT", 700)
+    np.testing.assert_array_equal(agreed(predicted[:3000], predicted), fast)
     monkeypatch.setenv("PNU_FAST", "0")
     np.testing.assert_allclose(agreed(predicted[:3000], predicted), fast, atol=1e-9)
 
