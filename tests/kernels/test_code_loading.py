@@ -54,11 +54,15 @@ from pnu.kernels import compilation
 from pnu.kernels.code_loading import load_code
 compilation.machine_code = lambda: None
 from pnu import weights
-from pnu.geometry import even_spacing, farthest_sampling, orientation, outlier_features, point_tree
+from pnu.geometry import even_spacing, farthest_sampling, normal_estimation, orientation, outlier_features, point_tree
 from pnu.networks.compiled_surface import compiled_feet, compiled_step
+from pnu.upsamplers import agreement
 modules = [importlib.import_module(f"pnu.kernels.{name}") for name in compilation.KERNELS]
 found = weights.read(weights.find("surface"), "numpy").state
-parameters = {name.removeprefix("projector."): value for name, value in found.items()}
+both = [
+    {name.removeprefix(part): value for name, value in found.items() if name.startswith(part)}
+    for part in ("projector.", "coarse.projector.")
+]
 def results():
     normals = np.random.default_rng(0).normal(size=(700, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -68,11 +72,15 @@ def results():
     near = orientation.NeighborCloud.of(points)
     lines = normals.astype(np.float32)
     yield from (dist, idx, compiled_feet(query, cloud, idx))
-    for sphere in (True, False):
-        yield compiled_step(parameters, sphere=sphere, attention=True)(query, cloud, idx)
+    for parameters in both:
+        for sphere in (True, False):
+            yield compiled_step(parameters, sphere=sphere, attention=True)(query, cloud, idx)
     yield farthest_sampling.farthest_order(points.astype(np.float32), 200, 3)
     yield even_spacing.repel(points, normals, steps=2)
     yield outlier_features.outlier_features(points)
+    yield normal_estimation.estimate_normals(points, orient=False)
+    yield normal_estimation.refit_normals(points, normals)
+    yield agreement.agreed(query, cloud)
     yield orientation._Pairs(near, np.sqrt(near.area)).inverse_cubes
     yield orientation._dipoles(near, lines, 1.4)
     yield orientation.field(near, lines, 0.1)
