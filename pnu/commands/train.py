@@ -78,7 +78,7 @@ def train(cfg: Any) -> list[float] | None:
         if source and not run.last.exists():  # a run that goes on has its own
             if source == "previous":
                 record["weights"] = source = str(sweeps.weights_before(run))
-            checkpoints.fill(model, checkpoints.load(source, allow).state_dict(), source)
+            checkpoints.start_from(model, checkpoints.load(source, allow), source)
         find = functools.partial(find_metric, allow=allow)
         chosen = metrics.with_own(config.get("metrics") or (), find)
         record["metrics"] = {m.shown.name: m.shown._asdict() for m in chosen if m not in metrics.METRICS}

@@ -168,6 +168,20 @@ def fill(network: nn.Module, state: Mapping[str, Tensor], source: str | PathLike
     network.load_state_dict(dict(state))
 
 
+def start_from(network: nn.Module, other: nn.Module, source: str | PathLike[str]) -> None:
+    """`fill` with the state of another network, for a training that goes on from it.
+
+    Parts that the network says are optional, by the beginning of their names, stay new where the other has none, and
+    are left out where only the other has them.
+    """
+    state, own = other.state_dict(), network.state_dict()
+    for part in getattr(network, "optional", ()):
+        new = {name: value for name, value in own.items() if name.startswith(part)}
+        if not new or not any(name.startswith(part) for name in state):
+            state = {name: value for name, value in state.items() if not name.startswith(part)} | new
+    fill(network, state, source)
+
+
 def save(folder: Path, network: nn.Module, config: Mapping[str, Any], record: Mapping[str, Any]) -> None:
     """Make a finished run folder of a network that was not trained here; it appears whole or not at all.
 

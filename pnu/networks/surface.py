@@ -108,6 +108,7 @@ class Surface(nn.Module):
     predicts_normals = True
     procedure = "surface"
     patch_size = 1024
+    optional = ("coarse.",)  # a training may begin with weights that have more or less of these
 
     def __init__(
         self, ratio: int = 4, neighbors: int = 24, reach: int = 24, width: int = 64, rounds: int = 2,

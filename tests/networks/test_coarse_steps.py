@@ -99,6 +99,24 @@ def test_what_a_file_says_and_has_must_agree(tmp_path: Path, compiled: None, sai
         checkpoints.load(file)
 
 
+def test_a_training_begins_with_weights_that_have_coarse_steps_or_none() -> None:
+    with_some, without = surface(8, seed=1), surface(0, seed=2)
+    new = {name: value.clone() for name, value in with_some.coarse.state_dict().items()}  # type: ignore[union-attr]
+    checkpoints.start_from(with_some, without, "without")
+    for name, value in without.state_dict().items():
+        assert torch.equal(with_some.state_dict()[name], value)
+    for name, value in new.items():
+        assert torch.equal(with_some.state_dict()[f"coarse.{name}"], value)
+    third = surface(0, seed=3)
+    checkpoints.start_from(third, with_some, "with")
+    assert all(torch.equal(third.state_dict()[name], value) for name, value in without.state_dict().items())
+    both = surface(8, seed=4)
+    checkpoints.start_from(both, with_some, "with")
+    assert all(torch.equal(both.state_dict()[name], value) for name, value in with_some.state_dict().items())
+    with pytest.raises(ValueError, match="other: expected the state of Surface"):
+        checkpoints.start_from(both, surface(8, width=8), "other")
+
+
 def test_exported_with_a_smaller_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
