@@ -40,7 +40,8 @@ CloudT = TypeVar("CloudT", "Floats", "Tensor")
 
 EVEN = 0.3  # standard deviation over mean of the nearest distance; 0.52 at random
 STILL_EVEN = 0.4  # so much where points were smoothed
-SMOOTH = 0.1  # noise in spacings from which on a cloud is smoothed first
+SMOOTH = FAINT  # noise in spacings from which on a cloud is smoothed first,
+MOVED = 2.0  # by so many times the noise at most, lest tips and lone points are drawn to the rest
 KEPT = 2**19  # queries whose projections are kept in one file
 BATCH = 512  # queries at once on a CPU,
 BATCHES = 32  # of which its threads share so many
@@ -164,8 +165,13 @@ class SurfaceProjection:
         )
 
     def smoothed(self, cloud: Floats, context: Context) -> Floats:
-        """A noisy cloud (n, 6) with its points projected, and normals found anew there if the network finds them."""
+        """A noisy cloud (n, 6) with its points projected, and normals found anew there if the network finds them.
+
+        None moves farther than noise may have moved it: a lone point at a tip is not drawn to the others.
+        """
         smooth, _ = self.projected(cloud, cloud, context, "smoothing, the points are noisy")
+        limit = MOVED * noise_level(cloud[:, :3], cloud[:, 3:])
+        smooth[:, :3] = no_farther(limit, cloud[:, :3], smooth[:, :3])
         if not self.network.passes:
             return smooth
         return self.with_normals(smooth, smooth, context, "normals of the smooth points")
@@ -316,6 +322,13 @@ def seeds_around(cloud: Floats, each: int, count: int, step: Step = silent, *, f
     else:
         kept = farthest_points_large(places, count, step=step)
     return np.hstack([places[kept], cloud[owner[kept], 3:]])
+
+
+def no_farther(limit: float, points: Floats, moved: Floats) -> Floats:
+    """Points (n, 3) on their way to where they are moved (n, 3), each there or as far as the limit."""
+    step = moved - points
+    share = np.minimum(1, limit / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-300))
+    return points + share * step
 
 
 def slid(query: Floats, refined: Floats, share: float) -> Floats:

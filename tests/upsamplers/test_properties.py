@@ -23,7 +23,7 @@ from pnu import benchmark
 from pnu.commands import picture, reconstruct
 from pnu.commands.upsample import main as upsample_main
 from pnu.data import shapes
-from pnu.geometry.mesh_sampling import closest_points, sample_area
+from pnu.geometry.mesh_sampling import closest_points, sample_area, sample_poisson_disk
 from pnu.io import read_cloud, read_mesh, write_cloud
 from pnu.runtime.system_libraries import open3d_error
 
@@ -219,6 +219,17 @@ def test_every_point_given_has_one_within_half_a_spacing(shape: str, ratio: floa
     share = cKDTree(dense[:, :3]).query(cloud[:, :3])[0] / around
     assert (share > 0.5).mean() < 0.005  # a tip may end a little before its point
     assert share.max() < 0.7
+
+
+@pytest.mark.parametrize(("shape", "noise"), [("queen", 0.003), ("horse", 0.006), ("queen", 0.01)])
+def test_every_noisy_point_has_one_within_a_quarter_of_a_spacing_and_the_noise(shape: str, noise: float) -> None:
+    rng = np.random.default_rng(5)
+    points = sample_poisson_disk(shapes.make(shape), 1200, rng)[:, :3]
+    points += rng.normal(scale=noise, size=points.shape)
+    dense = pnu.upsample(points)
+    around = cKDTree(points).query(points, 7)[0][:, 1:].mean(1)
+    apart = cKDTree(dense[:, :3]).query(points)[0]
+    assert (apart < 0.25 * around + noise).all()
 
 
 @pytest.mark.parametrize(("axis", "noise"), [(1.0, 0.02), (0.4, 0.01)])
