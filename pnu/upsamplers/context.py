@@ -20,7 +20,7 @@ Merge = Literal["farthest", "agreed"]
 
 @dataclass(frozen=True)
 class Context:
-    """How an upsampler runs. Seed, density, keep and merge have an influence on what comes out, nothing else."""
+    """How an upsampler runs. What comes out depends on seed, density, keep, smooth and merge, on nothing else."""
 
     device: torch.device | str = "cpu"
     """Where the network lies, and the cloud."""
@@ -38,6 +38,8 @@ class Context:
     """Of what comes out: even, follow the cloud's, or auto: even where no place loses points by it."""
     keep: bool = False
     """Whether the points of the cloud are to be among those that come out, unmoved."""
+    smooth: bool = False
+    """Whether points were found too noisy for that, and are to be smoothed even where refined normals show less."""
     merge: Merge = "farthest"
     """Of the predictions of patches that overlap, see `pnu.upsamplers.patches`."""
 

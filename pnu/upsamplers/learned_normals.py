@@ -4,10 +4,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnu.cleaning import Character, is_noisy
+from pnu.geometry.cloud_statistics import FAINT
 from pnu.runtime.progress import Progress, silent
 from pnu.upsamplers.context import Context
 from pnu.upsamplers.inference import LoadedWeights, inferring
-from pnu.upsamplers.surface_projection import SMOOTH, SurfaceProjection, noise_in_spacings
+from pnu.upsamplers.surface_projection import SurfaceProjection, noise_in_spacings
 
 PASSES = 2  # a third changes little
 Floats = NDArray[np.float64]
@@ -25,7 +26,7 @@ def learned_normals(points: Floats, normals: Floats, progress: Progress = silent
         upsampler, context = SurfaceProjection(network), Context(progress=progress)
         cloud = np.hstack([points, normals])
         cloud = upsampler.with_refined_normals(cloud, PASSES, context)
-        if noise_in_spacings(cloud) > SMOOTH:
+        if noise_in_spacings(cloud) > FAINT:
             cloud = upsampler.smoothed(cloud, context)
         found = cloud[:, 3:]
     return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-12))

@@ -40,13 +40,13 @@ CloudT = TypeVar("CloudT", "Floats", "Tensor")
 
 EVEN = 0.3  # standard deviation over mean of the nearest distance; 0.52 at random
 STILL_EVEN = 0.4  # so much where points were smoothed
-SMOOTH = FAINT  # noise in spacings from which on a cloud is smoothed first,
-MOVED = 2.0  # by so many times the noise at most, lest tips and lone points are drawn to the rest
+MOVED = 2.0  # smoothing moves points by so many times the noise at most, lest tips are drawn to the rest
 KEPT = 2**19  # queries whose projections are kept in one file
 BATCH = 512  # queries at once on a CPU,
 BATCHES = 32  # of which its threads share so many
 AROUND = 8  # points of which one at most is dropped,
 DOUBTFUL = 16  # looked for among so many for each point to drop
+DISTANT, RISKY = 8.0, 1.5  # weight of the distance from an even cloud, in spacings, beside the error; limit of both
 ROOM = 0.7  # around a point that is kept, in spacings that evenly spread points would have
 LONG = 10_000  # points made from which on a computation takes long enough to have kernels compiled beside it
 SPACED = 6  # neighbors whose mean distance is the spacing at a point of the cloud,
@@ -84,7 +84,7 @@ class SurfaceProjection:
         if count >= LONG:
             compile_in_background()
         cloud = self.with_refined_normals(cloud, self.network.passes, context)
-        if noise_in_spacings(cloud) > SMOOTH:
+        if context.smooth or noise_in_spacings(cloud) > FAINT:
             measured, cloud = cloud, self.smoothed(cloud, context)
             staying = cloud if count > len(cloud) and is_even(cloud, STILL_EVEN) else cloud[:0]
         else:
@@ -136,6 +136,9 @@ class SurfaceProjection:
         for i in range(1, network.refinements + 1):
             refined, error = self.projected(query, cloud, context, f"refinement {i}", steps[i])
             query = slid(query, refined, network.slide)
+        if len(kept) and not part and is_even(cloud):
+            near = within_reach(query[:, :3], error, cloud[:, :3], new)
+            query, error = query[near], error[near]
         query = query[reject_worst(query[:, :3], error, new)]
         if first == len(cloud):  # of a part others make what lies at its borders
             query = self.covering(query, kept, cloud, context)
@@ -338,6 +341,19 @@ def slid(query: Floats, refined: Floats, share: float) -> Floats:
     step, normals = refined[:, :3] - query[:, :3], refined[:, 3:]
     along = step - (step * normals).sum(1, keepdims=True) * normals
     return np.hstack([refined[:, :3] - (1 - share) * along, normals])
+
+
+def within_reach(points: Floats, error: Floats, cloud: Floats, count: int) -> Index:
+    """Indices, ascending, of at least `count` of the points (m, 3): some that lie far from all of a cloud are left out.
+
+    The surface is nowhere farther than about a spacing from an even cloud (n, 3). What is as far, and what is nearer
+    but has a high expected error (m,), lies between walls or beyond edges.
+    """
+    risk = error + DISTANT * _nearest(points, cloud)[0] / spacing(cloud)
+    far = (-risk).argsort(kind="stable")[: len(points) - count]
+    stays = np.ones(len(points), bool)
+    stays[far[risk[far] > RISKY]] = False
+    return np.flatnonzero(stays)
 
 
 def reject_worst(points: Floats, error: Floats, count: int) -> Index:

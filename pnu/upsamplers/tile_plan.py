@@ -25,6 +25,7 @@ from pnu.cleaning.outliers import MANY
 from pnu.geometry.anisotropy import thinned_lines
 from pnu.geometry.cells import Cells
 from pnu.geometry.cloud_normals import contradiction, is_height_map, settled_normals
+from pnu.geometry.cloud_statistics import FAINT
 from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.point_tree import PointTree
 from pnu.geometry.spacing import local_spacing
@@ -34,7 +35,7 @@ from pnu.io.fields import GEOGRAPHIC, as_colors
 from pnu.io.point_stream import in_range, is_geographic, point_slices
 from pnu.io.sensor import Sight, asked_sight, sight_of
 from pnu.runtime.progress import Progress, silent
-from pnu.upsamplers.surface_projection import SMOOTH, is_clean_and_even, noise_in_spacings
+from pnu.upsamplers.surface_projection import is_clean_and_even, noise_in_spacings
 
 SAMPLE = 2**18  # points that say where tiles are cut,
 COARSE = 50_000  # and of the coarse cloud that says to which side normals look
@@ -410,7 +411,7 @@ def _look(points: np.ndarray, normals: np.ndarray | None, keys: Keys, size: int)
     known = settled_normals(points, normals).normals
     scale = np.abs(points - points.mean(0)).max()
     cloud = np.hstack([(points - points.mean(0)) / scale, known])
-    look["noisy"] = noise_in_spacings(cloud) > SMOOTH
+    look["noisy"] = noise_in_spacings(cloud) > FAINT
     look["loud"] = is_noisy(points, known)
     look["even"] = thinned is None and is_clean_and_even(cloud)
     return look

@@ -18,6 +18,7 @@ from pnu import __version__
 from pnu.cleaning import Character, Cleaned, Treatment, clean_cloud
 from pnu.geometry.attributes import carry
 from pnu.geometry.cloud_normals import check_not_a_line, settled_normals
+from pnu.geometry.cloud_statistics import FAINT
 from pnu.geometry.normal_estimation import complete_normals
 from pnu.geometry.point_tree import PointTree
 from pnu.geometry.unit_sphere import Frame, unit_sphere_frame
@@ -34,7 +35,7 @@ from pnu.upsamplers.density import DENSITIES, Density, count_of_spacing
 from pnu.upsamplers.inference import LoadedWeights, inferring, modules_of, on_device
 from pnu.upsamplers.learned_normals import learned_normals
 from pnu.upsamplers.selection import upsampler_of
-from pnu.upsamplers.surface_projection import SurfaceProjection, is_clean_and_even
+from pnu.upsamplers.surface_projection import SurfaceProjection, is_even, noise_in_spacings
 from pnu.upsamplers.unit_normals import with_unit_normals
 
 if TYPE_CHECKING:
@@ -220,10 +221,15 @@ def upsample(
             f"{asked}: {type(network).__name__} spreads new points evenly; take model surface (run=surface)"
         )
     follows = getattr(upsampler, "follows", False)
-    keeps = (follows and is_clean_and_even(sparse)) if keep == "auto" else keep
-    digest = _digest(network, sparse, count, upsampler, density, keeps, merge)
+    even = follows and keep == "auto" and is_even(sparse)
+    clean = even and noise_in_spacings(sparse) < FAINT
+    keeps = clean if keep == "auto" else keep
+    digest = _digest(network, sparse, count, upsampler, density, keeps, even, merge)
     finished = Parts() if parts is None else Parts(Path(parts) / digest)
-    context = Context(target, batch_size, int(seed), progress, finished, density=density, keep=keeps, merge=merge)
+    context = Context(
+        target, batch_size, int(seed), progress, finished,
+        density=density, keep=keeps, smooth=even and not clean, merge=merge,
+    )  # fmt: skip
     with inferring(network), ExitStack() as stack:
         if devices > 1:
             theirs = copy.deepcopy(network).cpu() if modules_of(network) else network

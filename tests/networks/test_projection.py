@@ -18,7 +18,7 @@ from pnu.metrics.functional import uniformity
 from pnu.networks.surface import Projector, Surface
 from pnu.upsamplers import Context, SurfaceProjection
 from pnu.upsamplers import surface_projection as procedure
-from pnu.upsamplers.surface_projection import approached, reject_worst, slid
+from pnu.upsamplers.surface_projection import approached, no_farther, reject_worst, slid, within_reach
 
 
 def upsample(network: Surface, cloud: Tensor, count: int, **options: Any) -> Tensor:
@@ -459,3 +459,18 @@ def test_no_holes_where_points_were_rejected() -> None:
     truth = wavy_sphere(400_000)[:, :3]
     assert dense.query(truth)[0].max() < 1.3 * apart
     assert cKDTree(cloud[:, :3]).query(truth)[0].max() > 2 * apart  # of the input, which is random
+
+
+def test_no_point_moves_farther_than_the_limit() -> None:
+    moved = no_farther(0.1, np.zeros((3, 3)), np.array([[0.05, 0, 0], [0, 0.3, 0.4], [0, 0, 0]]))
+    np.testing.assert_allclose(moved, [[0.05, 0, 0], [0, 0.06, 0.08], [0, 0, 0]], atol=1e-15)
+
+
+def test_what_lies_far_from_an_even_cloud_is_left_out() -> None:
+    """Over a grid of spacing 1: at half of it, at 1.5, at 2, at 2 of a surer one; no more than there are too many."""
+    cloud = np.stack([*np.meshgrid(np.arange(9.0), np.arange(9.0)), np.zeros((9, 9))], -1).reshape(-1, 3)
+    points = np.array([[4, 4, 0.5], [4, 4, 1.5], [3, 4, 2], [5, 4, 2]])
+    error = np.array([-7.0, -7, -7, -15])  # 8 a spacing makes 1.5 of -7 and 1.06
+    np.testing.assert_array_equal(within_reach(points, error, cloud, 1), [0, 3])
+    np.testing.assert_array_equal(within_reach(points, error, cloud, 3), [0, 1, 3])  # the farthest goes first
+    np.testing.assert_array_equal(within_reach(points, error, cloud, 4), [0, 1, 2, 3])

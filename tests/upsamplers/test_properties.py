@@ -232,6 +232,14 @@ def test_every_noisy_point_has_one_within_a_quarter_of_a_spacing_and_the_noise(s
     assert (apart < 0.25 * around + noise).all()
 
 
+def test_points_stay_also_where_thin_walls_look_like_noise() -> None:
+    """Between fins rough normals see noise, refined ones do not: either way each point has one near."""
+    points = sample_poisson_disk(shapes.make("heat_sink"), 1000, np.random.default_rng(5))[:, :3]
+    dense = pnu.upsample(points)
+    around = cKDTree(points).query(points, 7)[0][:, 1:].mean(1)
+    assert (cKDTree(dense[:, :3]).query(points)[0] < 0.15 * around).all()
+
+
 @pytest.mark.parametrize(("axis", "noise"), [(1.0, 0.02), (0.4, 0.01)])
 def test_noise_shrinks_nothing(axis: float, noise: float) -> None:
     """A sphere, and an ellipsoid with tips: mean distance from the true surface, inside or outside, in noises."""
