@@ -331,7 +331,8 @@ def no_farther(limit: float, points: Floats, moved: Floats) -> Floats:
     """Points (n, 3) on their way to where they are moved (n, 3), each there or as far as the limit."""
     step = moved - points
     share = np.minimum(1, limit / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-300))
-    return points + share * step
+    found: Floats = points + share * step
+    return found
 
 
 def slid(query: Floats, refined: Floats, share: float) -> Floats:
