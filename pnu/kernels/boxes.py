@@ -17,12 +17,29 @@ def _swap(place: Floats, order: Ints, i: int, j: int) -> None:
         place[i, axis], place[j, axis] = place[j, axis], place[i, axis]
 
 
+PATIENCE = 48  # rounds of a selection, of which a million points take some twenty
+
+
 @kernel(exact=True, inner=True)
 def _split(place: Floats, order: Ints, first: int, stop: int, cut: int, axis: int) -> None:
-    """Points before `cut` are not above those from it on (Hoare's selection)."""
+    """Points before `cut` are not above those from it on (Hoare's selection).
+
+    There are orders, sorted clouds among them, in which first, middle and last make a bad pivot again and again. After
+    a while others are drawn, lest time grow with the square of the points.
+    """
     low, high = first, stop - 1
+    rounds, drawn = 0, 1
     while low < high:
-        a, b, c = place[low, axis], place[(low + high) // 2, axis], place[high, axis]
+        one, two, three = low, (low + high) // 2, high
+        rounds += 1
+        if rounds > PATIENCE:
+            drawn = (1103515245 * drawn + 12345) % 2147483648
+            one = low + drawn % (high - low + 1)
+            drawn = (1103515245 * drawn + 12345) % 2147483648
+            two = low + drawn % (high - low + 1)
+            drawn = (1103515245 * drawn + 12345) % 2147483648
+            three = low + drawn % (high - low + 1)
+        a, b, c = place[one, axis], place[two, axis], place[three, axis]
         pivot = max(min(a, b), min(max(a, b), c))
         i, j = low, high
         while i <= j:

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from pnu.geometry import farthest_sampling
 from pnu.geometry.point_tree import PointTree
 from pnu.geometry.sampling import farthest_points
+from pnu.kernels.boxes import box_order
 
 KINDS = ("random", "plane", "line", "equal", "repeated", "far", "lattice", "clusters")
 Points = np.ndarray
@@ -154,3 +155,14 @@ def test_what_is_not_finite_is_refused_or_chosen_from_plainly(value: float) -> N
     chosen = farthest_points(torch.from_numpy(bad)[None].float(), 20)
     assert chosen.shape == (1, 20)
     assert ((chosen >= 0) & (chosen < 200)).all()
+
+
+@pytest.mark.parametrize("first", [50_000, 66_000, 99_999])
+def test_boxes_of_sorted_points_of_which_one_goes_first(first: int) -> None:
+    """Sorted but for one: its selections take rounds by the thousand where pivots are always the same three."""
+    row = np.arange(100_000.0)
+    row = np.concatenate([row[[first]], np.delete(row, first)])
+    order = box_order(np.column_stack([row, np.zeros((len(row), 2))]), 32)
+    leaves = row[order].reshape(-1, 32)
+    assert (leaves[1:].min(1) > leaves[:-1].max(1)).all()
+    assert sorted(order) == list(range(len(row)))
