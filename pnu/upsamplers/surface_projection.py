@@ -300,11 +300,6 @@ def is_even(cloud: Floats, limit: float = EVEN) -> bool:
     return bool(apart.std(ddof=1) < limit * apart.mean())
 
 
-def is_clean_and_even(cloud: Floats) -> bool:
-    """Whether the points of a cloud (n, 6) are evenly spread and show no noise."""
-    return is_even(cloud) and noise_in_spacings(cloud) < FAINT
-
-
 def seeds_around(cloud: Floats, each: int, count: int, step: Step = silent, *, first: int | None = None) -> Floats:
     """Points of a cloud (n, 6) and `each` seeds around each, thinned to (count, 6), with the points' normals.
 

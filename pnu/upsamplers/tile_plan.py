@@ -35,7 +35,7 @@ from pnu.io.fields import GEOGRAPHIC, as_colors
 from pnu.io.point_stream import in_range, is_geographic, point_slices
 from pnu.io.sensor import Sight, asked_sight, sight_of
 from pnu.runtime.progress import Progress, silent
-from pnu.upsamplers.surface_projection import is_clean_and_even, noise_in_spacings
+from pnu.upsamplers.surface_projection import is_even, noise_in_spacings
 
 SAMPLE = 2**18  # points that say where tiles are cut,
 COARSE = 50_000  # and of the coarse cloud that says to which side normals look
@@ -413,7 +413,7 @@ def _look(points: np.ndarray, normals: np.ndarray | None, keys: Keys, size: int)
     cloud = np.hstack([(points - points.mean(0)) / scale, known])
     look["noisy"] = noise_in_spacings(cloud) > FAINT
     look["loud"] = is_noisy(points, known)
-    look["even"] = thinned is None and is_clean_and_even(cloud)
+    look["even"] = thinned is None and is_even(cloud) and not look["noisy"]
     return look
 
 
