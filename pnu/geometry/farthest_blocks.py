@@ -6,9 +6,9 @@ already: nothing closer than the distance to a neighbor's point is a candidate a
 the order of choice. Blocks that are no neighbors work at the same time; the result does not depend on it.
 """
 
-import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from itertools import count
 from typing import NamedTuple, Protocol
 
@@ -19,8 +19,8 @@ from pnu.geometry.spatial_blocks import Blocks, Index, split_blocks
 from pnu.runtime.progress import Step, silent
 
 BLOCK = 2**16  # points
-SURPLUS = 1.006  # points to choose, of those wanted: the last ones are dropped for an exact count
-CLOSE = 1.01  # a greater surplus is worth another try,
+SURPLUS = 1.01  # points to choose, of those wanted: the last ones are dropped for an exact count
+CLOSE = 1.02  # a greater surplus is worth another try,
 TRIES = 3  # of so many
 MARGIN = 4  # distances around a block within which it sees its neighbors
 PROBES = 48  # chosen points whose distance to those chosen before is looked up
@@ -68,6 +68,8 @@ def farthest_in_blocks(
     """
     n = len(xyz)
     blocks = split_blocks(xyz, size or BLOCK)
+    of_block = np.concatenate(blocks.members)
+    xyz, blocks = xyz.take(of_block, 0), blocks.in_a_row()
     wanted = min(SURPLUS * m, n)
     done, total = 0, 2 * len(blocks.members)
     step(0, total)
@@ -79,29 +81,28 @@ def farthest_in_blocks(
 
     with ThreadPoolExecutor(threads) as pool:
 
-        def first(members: Index) -> Decline:
-            number = min(int(1.1 * wanted * len(members) / n) + 16, len(members))
-            return decline_of(choose(xyz[members], number)[1], len(members))
+        def alone(members: Index, share: float) -> Decline:
+            number = min(int(share * len(members)) + 16, len(members))
+            return decline_of(choose(xyz.take(members, 0), number)[1], len(members))
 
         declines = []
-        for decline in pool.map(first, blocks.members):
+        for decline in pool.map(partial(alone, share=1.1 * wanted / n), blocks.members):
             declines.append(decline)
             tick()
-        reach, power, before = _common_distance(declines, wanted), 2.0, (0.0, 0)
+        reach = _common_distance(declines, wanted)
+        sparse = [number for number, decline in enumerate(declines) if decline.distance[-1] > reach]
+        full = pool.map(partial(alone, share=1.0), [blocks.members[number] for number in sparse])
+        for number, decline in zip(sparse, full, strict=True):
+            declines[number] = decline
+        asked = wanted
         for attempt in count():
+            reach = _common_distance(declines, asked) if attempt <= TRIES + 1 else 0.0  # 0 takes all
             total = (2 + attempt) * len(blocks.members)
             chosen, distance = _choose_all(xyz, blocks, reach, choose, pool, tick)
             surplus = len(chosen) / m
             if surplus >= 1 and (surplus <= CLOSE or attempt >= TRIES or len(chosen) == n):
-                return chosen[np.argsort(-distance, kind="stable")[:m]]
-            if attempt > TRIES or reach < 1e-9 * np.ptp(xyz, axis=0).max():
-                reach = 0.0  # takes all
-            else:
-                # on a surface the number falls with the square of the distance, in a thick layer faster
-                if before[1] not in (0, len(chosen)):
-                    power = min(max(math.log(before[1] / len(chosen)) / math.log(reach / before[0]), 1.0), 6.0)
-                before = reach, len(chosen)
-                reach *= (len(chosen) / wanted) ** (1 / power)
+                return of_block[chosen[np.argsort(-distance, kind="stable")[:m]]]
+            asked *= wanted / len(chosen)
     raise AssertionError
 
 
@@ -119,20 +120,21 @@ def _choose_all(
     distance = [np.empty(0)] * len(blocks.members)
     margin = MARGIN * reach
     waiting = np.ones(len(xyz), bool)  # members of blocks whose turn is yet to come
+    free = np.ones(len(xyz), bool)  # points not chosen
 
     def work(number: int) -> tuple[Index, NDArray[np.float64]]:
         own = blocks.members[number]
         near = [chosen[other] for other in blocks.near(number, margin)]
-        fixed = np.concatenate([none, *(idx[blocks.inside(xyz[idx], number, margin)] for idx in near)])
+        fixed = np.concatenate([none, *(idx[blocks.inside(xyz.take(idx, 0), number, margin)] for idx in near)])
         halo = blocks.halo(xyz, number, margin)
         both = np.concatenate([fixed, own, halo[waiting[halo]]])
-        order, far = choose(xyz[both], len(both), given=len(fixed), least=reach)
+        order, far = choose(xyz.take(both, 0), len(both), given=len(fixed), least=reach)
         mine = (order >= len(fixed)) & (order < len(fixed) + len(own))
         idx = both[order[mine]]
         # near a border the distance may be one to a point that the neighbor will not choose: such points are kept
-        seen = np.zeros(len(idx), bool)
+        seen, places = np.zeros(len(idx), bool), xyz.take(idx, 0)
         for other in blocks.near(number, margin):
-            seen |= blocks.inside(xyz[idx], other, 2 * reach)
+            seen |= blocks.inside(places, other, 2 * reach)
         return idx, np.where(seen, np.inf, far[mine])
 
     for group in blocks.colors(margin):
@@ -140,26 +142,30 @@ def _choose_all(
             waiting[blocks.members[number]] = False
         for number, (idx, far) in zip(group, pool.map(work, group), strict=True):
             chosen[number], distance[number] = idx, far
+            free[idx] = False
             tick()
 
     def fill(number: int) -> tuple[Index, NDArray[np.float64]]:
         """Holes at the borders, where a block relied on points of a neighbor's that were not chosen in the end."""
         own, mine, near = blocks.members[number], chosen[number], blocks.near(number, margin)
+        own = own[free[own]]
         edge, beside = np.zeros(len(own), bool), np.zeros(len(mine), bool)
+        own_places, places = xyz.take(own, 0), xyz.take(mine, 0)
         for other in near:
-            edge |= blocks.inside(xyz[own], other, reach)
-            beside |= blocks.inside(xyz[mine], other, 2 * reach)
-        theirs = [chosen[other][blocks.inside(xyz[chosen[other]], number, reach)] for other in near]
-        taken, free = np.concatenate([mine[beside], *theirs]), np.setdiff1d(own[edge], mine)
-        if not len(free) or not len(taken):
+            edge |= blocks.inside(own_places, other, reach)
+            beside |= blocks.inside(places, other, 2 * reach)
+        theirs = [chosen[other][blocks.inside(xyz.take(chosen[other], 0), number, reach)] for other in near]
+        taken, open_ = np.concatenate([mine[beside], *theirs]), own[edge]
+        if not len(open_) or not len(taken):
             return none, np.empty(0)
-        both = np.concatenate([taken, free])
-        order, _ = choose(xyz[both], len(both), given=len(taken), least=reach)
+        both = np.concatenate([taken, open_])
+        order, _ = choose(xyz.take(both, 0), len(both), given=len(taken), least=reach)
         added = both[order[len(taken) :]]
         return added, np.full(len(added), np.inf)
 
     for group in blocks.colors(margin):
         for number, (idx, far) in zip(group, pool.map(fill, group), strict=True):
+            free[idx] = False
             chosen[number] = np.concatenate([chosen[number], idx])
             distance[number] = np.concatenate([distance[number], far])
     return np.concatenate(chosen), np.concatenate(distance)

@@ -15,9 +15,16 @@ SPREAD_BITS = ((16, 0x0000FF0000FF), (8, 0x00F00F00F00F), (4, 0x0C30C30C30C3), (
 class Blocks(NamedTuple):
     """A cloud cut into b blocks; every point is in one."""
 
-    members: list[Index]  # points of each block
+    members: list[Index]  # points of each block, ascending
     low: Points  # (b, 3) and
     high: Points  # (b, 3): corners of the boxes that hold them
+
+    def in_a_row(self) -> "Blocks":
+        """The same of the cloud whose points are put in the order of the blocks, so that those of each lie together."""
+        stops = np.cumsum([len(part) for part in self.members])
+        return self._replace(
+            members=[np.arange(stop - len(part), stop) for part, stop in zip(self.members, stops, strict=True)]
+        )
 
     def near(self, number: int, margin: float) -> list[int]:
         """Other blocks whose boxes are at most `margin` away, in each axis, from the box of a block."""
@@ -37,7 +44,7 @@ class Blocks(NamedTuple):
         parts = [np.empty(0, np.int64)]
         for other in self.near(number, margin):
             members = self.members[other]
-            parts.append(members[self.inside(points[members], number, margin)])
+            parts.append(members[self.inside(points.take(members, 0), number, margin)])
         return np.concatenate(parts)
 
     def colors(self, margin: float) -> list[list[int]]:
@@ -59,18 +66,17 @@ def split_blocks(points: Points, size: int) -> Blocks:
     """Blocks of at most `size` of the points (n, 3), by halving the longest side of the box, always at the median."""
     members: list[Index] = []
     boxes: list[tuple[Points, Points]] = []
-    todo = [np.arange(len(points))]
+    todo = [(np.arange(len(points)), np.ascontiguousarray(points.T))]
     while todo:
-        part = todo.pop()
-        place = points[part]
-        low, high = place.min(0), place.max(0)
+        part, axes = todo.pop()
+        low, high = axes.min(1), axes.max(1)
         if len(part) <= size:
             members.append(np.sort(part))
             boxes.append((low, high))
             continue
         half = len(part) // 2
-        order = np.argpartition(place[:, (high - low).argmax()], half)
-        todo += [part[order[half:]], part[order[:half]]]
+        order = np.argpartition(axes[(high - low).argmax()], half)
+        todo += [(part[rows], axes.take(rows, 1)) for rows in (order[half:], order[:half])]
     return Blocks(members, np.array([low for low, _ in boxes]), np.array([high for _, high in boxes]))
 
 

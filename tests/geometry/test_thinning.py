@@ -74,6 +74,16 @@ def test_uneven_clouds_become_even() -> None:
     np.testing.assert_allclose(spacing(points[chosen]).mean(0), spacing(points[whole]).mean(0), rtol=0.01)
 
 
+@pytest.mark.parametrize(("share", "m"), [(0.1, 20_000), (0.15, 30_000), (1, 40_000)])
+def test_the_common_distance_is_found_at_once(share: float, m: int) -> None:
+    points = sphere(80_000)
+    points = points[np.random.default_rng(0).random(len(points)) < np.where(points[:, 2] > 0, 1, share)]
+    steps: list[tuple[int, int]] = []
+    farthest_in_blocks(points, m, farthest_apart, size=SIZE, step=lambda *step: steps.append(step))
+    rounds = steps[-1][1] // len(split_blocks(points, SIZE).members)
+    assert rounds <= 3  # one alone, one together, and one more where so small blocks mislead
+
+
 def test_threads_do_not_matter_and_front_parts_are_even() -> None:
     points = sphere(30_000)
     one, three = (farthest_in_blocks(points, 9000, farthest_apart, size=SIZE, threads=threads) for threads in (1, 3))
