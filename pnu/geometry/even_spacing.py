@@ -76,7 +76,7 @@ def repel(points: Floats, normals: Floats, *, steps: int, step: Step = silent, m
         step(total, total)
         return points.copy()
     order = along_curve(points)
-    points, normals = points[order], np.ascontiguousarray(normals[order])
+    points, normals = points.take(order, 0), normals.take(order, 0)
     fixed = order >= (m if movable is None else movable)
     distance, near = np.empty((m, k - 1)), np.empty((m, k - 1), np.int64)
     for _ in range(steps):

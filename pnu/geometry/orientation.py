@@ -160,9 +160,19 @@ class _Pairs:
         return found
 
     def _sums(self, columns: Array) -> Array:
-        """The matrix times columns (n, c), block by block, the same for any number of threads."""
-        blocks = threads.map_on_threads(lambda rows: self.inverse_cubes[rows] @ columns, _blocks(columns))
-        return np.concatenate(blocks)
+        """The matrix times columns (n, c)."""
+        return _times(self.inverse_cubes, columns)
+
+
+def _times(matrix: Array, columns: Array) -> Array:
+    """A matrix (n, n) times columns (n, c), block by block, the same for any number of threads: (n, c)."""
+    if not kernels.ready():
+        return np.concatenate(threads.map_on_threads(lambda rows: matrix[rows] @ columns, _blocks(columns)))
+    from pnu.kernels.dipoles import rows_times
+
+    out, across = np.empty(columns.shape, f32), np.ascontiguousarray(columns.T)
+    threads.map_on_threads(lambda rows: rows_times(matrix[rows], across, out[rows]), _blocks(columns))
+    return out
 
 
 def _open_signs(cloud: NeighborCloud, lines: Array, along: Array) -> Array:
@@ -186,11 +196,11 @@ def _open_signs(cloud: NeighborCloud, lines: Array, along: Array) -> Array:
 def _settled(dipoles: Array, sign: Array) -> tuple[Array, float]:
     """Signs turned along the field of all dipoles until they agree with it, and their energy."""
     for _ in range(20):
-        along = dipoles @ sign
+        along = _times(dipoles, sign[:, None])[:, 0]
         if bool((along * sign >= 0).all()):
             break
         sign = _sign(along)
-    return sign, -float(sign @ (dipoles @ sign))
+    return sign, -float((sign * _times(dipoles, sign[:, None])[:, 0]).sum())
 
 
 def _sign(values: NDArray[np.floating]) -> Array:

@@ -56,15 +56,16 @@ class PointTree:
             order = self._order(queries)
             back = np.empty_like(order)
             back[order] = np.arange(len(order))
-            dist, idx = self.nearest_sq(queries[order], k, threads=threads, ordered=True)
-            return dist[back], idx[back]
-        parts = [queries[start : start + CHUNK] for start in range(0, len(queries), CHUNK)]
+            dist, idx = self.nearest_sq(queries.take(order, 0), k, threads=threads, ordered=True)
+            return dist.take(back, 0), idx.take(back, 0)
+        dist, idx = np.empty((len(queries), k)), np.empty((len(queries), k), np.int64)
+        parts = [slice(start, start + CHUNK) for start in range(0, len(queries), CHUNK)]
         if threads == 1 or len(parts) < 2:
-            idx, dist = self.tree.search(queries, k)
+            self.tree.search(queries, idx, dist)
             return dist, idx
         with ThreadPoolExecutor(threads) as pool:
-            found = list(pool.map(lambda part: self.tree.search(part, k), parts))
-        return np.concatenate([dist for _, dist in found]), np.concatenate([idx for idx, _ in found])
+            list(pool.map(lambda part: self.tree.search(queries[part], idx[part], dist[part]), parts))
+        return dist, idx
 
     def _order(self, queries: NDArray[np.float64]) -> NDArray[np.int64]:
         if queries is self.points:

@@ -52,6 +52,19 @@ def dipole_rows(sources: Singles, first: int, out: Singles) -> None:
         out[i, first + i] = 0
 
 
+@kernel("void(float32[:, ::1], float32[:, ::1], float32[:, ::1])")
+def rows_times(rows: Singles, columns: Singles, out: Singles) -> None:
+    """out[i, c]: row i of (r, n) times column c, which is a row of columns (c, n).
+
+    NumPy's product, called from several threads, has each wait for threads of its own."""
+    for i in range(len(rows)):
+        for c in range(len(columns)):
+            total = f32(0)
+            for j in range(rows.shape[1]):
+                total += rows[i, j] * columns[c, j]
+            out[i, c] = total
+
+
 @kernel("void(float32[:, ::1], int64[:, ::1], int64, float32[:, ::1])")
 def neighbor_field(sources: Singles, idx: Ints, first: int, out: Singles) -> None:
     """Unit vectors (m, 3) along the field at sources first + i of their neighbors' dipoles, idx (n, k): itself is the

@@ -42,13 +42,10 @@ class NeighborTree:
         self.parts = places, axes, ids, boxes, np.array(levels, np.int64)
         _fill_tree(places, self.order, *self.parts[1:])
 
-    def search(self, queries: NDArray[np.floating], k: int) -> tuple[Ints, Floats]:
-        """The k <= n nearest points of each query (m, 3): `idx[i, j]` is the j-th nearest of query i, and their squared
-        distances, both (m, k). Fast where each query is near the one before (`box_order`)."""
-        queries = np.require(queries, np.float64, ["C", "W", "A"])
-        idx, dist_sq = np.empty((len(queries), k), np.int64), np.empty((len(queries), k))
-        _search(queries, k, *self.parts, idx, dist_sq)
-        return idx, dist_sq
+    def search(self, queries: NDArray[np.floating], idx: Ints, dist_sq: Floats) -> None:
+        """The k <= n nearest points of each query (m, 3): into `idx[i, j]` the j-th nearest of query i, and their
+        squared distances, both (m, k). Fast where each query is near the one before (`box_order`)."""
+        _search(np.require(queries, np.float64, ["C", "W", "A"]), idx.shape[1], *self.parts, idx, dist_sq)
 
 
 @kernel("void(float64[:, ::1], int64[::1], float64[:, ::1], int64[::1], float64[:, :, ::1], int64[::1])", exact=True)

@@ -204,7 +204,7 @@ def in_parts(
     on_cpu = str(context.device) == "cpu"
     size = queries_at_once(on_cpu, context.batch_size) * (BATCHES if on_cpu else 1)
     order = along_curve(query[:, :3])
-    query = query[order]
+    query = query.take(order, 0)
 
     def project(first: int) -> Floats:
         some = query[first : first + KEPT]
@@ -319,7 +319,7 @@ def seeds_around(cloud: Floats, each: int, count: int, step: Step = silent, *, f
         step(1, 1)
     else:
         kept = farthest_points_large(places, count, step=step)
-    return np.hstack([places[kept], cloud[owner[kept], 3:]])
+    return np.hstack([places.take(kept, 0), cloud[owner[kept], 3:]])
 
 
 def no_farther(limit: float, points: Floats, moved: Floats) -> Floats:
@@ -407,7 +407,7 @@ def thin(cloud: Floats, count: int, step: Step = silent) -> Floats:
     """Farthest points of a cloud (n, 6): (min(n, count), 6)."""
     if len(cloud) <= count:
         return cloud
-    return cloud[farthest_points_large(cloud[:, :3], count, step=step)]
+    return cloud.take(farthest_points_large(cloud[:, :3], count, step=step), 0)
 
 
 def _nearest(queries: Floats, points: Floats) -> tuple[Floats, Index]:

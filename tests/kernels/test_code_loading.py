@@ -83,6 +83,7 @@ def results():
     yield agreement.agreed(query, cloud)
     yield orientation._Pairs(near, np.sqrt(near.area)).inverse_cubes
     yield orientation._dipoles(near, lines, 1.4)
+    yield orientation._Pairs(near, np.sqrt(near.area)).winding(lines)
     yield orientation.field(near, lines, 0.1)
 def called(kernel, name):
     def call(*values):

@@ -41,13 +41,15 @@ KINDS = pytest.mark.parametrize("kind", ["ellipsoid", "sheet", "repeated", "far"
 
 @KINDS
 @pytest.mark.parametrize("n", [7, 130, 300])
-@pytest.mark.parametrize("what", ["distances", "dipoles", "field"])
+@pytest.mark.parametrize("what", ["distances", "dipoles", "winding", "adjoint", "field"])
 def test_fields_equal_plain_ones(monkeypatch: pytest.MonkeyPatch, what: str, n: int, kind: str) -> None:
     points, normals = shape(kind, n)
     cloud, lines = NeighborCloud.of(points), normals.astype(np.float32)
     ways: dict[str, Callable[[], np.ndarray]] = {
         "distances": lambda: orientation._Pairs(cloud, np.sqrt(cloud.area)).inverse_cubes,
         "dipoles": lambda: orientation._dipoles(cloud, lines, 1.4),
+        "winding": lambda: orientation._Pairs(cloud, np.sqrt(cloud.area)).winding(lines),
+        "adjoint": lambda: orientation._Pairs(cloud, np.sqrt(cloud.area)).transposed(lines[:, 0]),
         "field": lambda: orientation.field(cloud, lines, 0.1),
     }
     # the plain distances of all pairs are differences of squares, which cost digits
