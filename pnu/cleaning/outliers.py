@@ -33,6 +33,7 @@ APART = 6.0  # usual spacings between a piece and all others
 EVEN = 0.45  # breadth of the middle 80 % of nearest distances over their median, below which points keep a distance
 FITS = (0.6, 1.6)  # nearest distances over those around, of points that fit into such an order
 FEWEST = 64  # points of a cloud in which strays can be told
+ROWS = 2**12  # points of which a detector keeps the intermediate results at a time
 
 
 @cache
@@ -45,13 +46,17 @@ def detector_weights(name: str) -> dict[str, NDArray[np.float32]]:
 
 def stray_odds(features: NDArray[np.float32], name: str = "outliers") -> NDArray[np.float32]:
     """Logarithm of the odds that each point is stray, (n,), of features as a detector wants them."""
-    weights = detector_weights(name)
-    values = (features - weights["mean"]) / weights["deviation"]
-    for layer in (0, 2, 4):
-        values = values @ weights[f"layers.{layer}.weight"].T + weights[f"layers.{layer}.bias"]
-        if layer < 4:
-            np.maximum(values, 0, out=values)
-    return values[:, 0]
+    weights, odds = detector_weights(name), np.empty(len(features), np.float32)
+    for first in range(0, len(features), ROWS):
+        part = slice(first, first + ROWS)
+        values = (features[part] - weights["mean"]) / weights["deviation"]
+        for layer in (0, 2, 4):
+            values = values @ weights[f"layers.{layer}.weight"].T
+            values += weights[f"layers.{layer}.bias"]
+            if layer < 4:
+                np.maximum(values, 0, out=values)
+        odds[part] = values[:, 0]
+    return odds
 
 
 def stray_points(points: NDArray[np.float64], camera: NDArray[np.float64] | None = None) -> NDArray[np.bool_]:

@@ -37,19 +37,26 @@ def outlier_features(points: NDArray[np.float64]) -> NDArray[np.float32]:
     if k < NEIGHBORS:
         missing = ((0, 0), (0, NEIGHBORS - k))
         distance, near = np.pad(distance, missing, mode="edge"), np.pad(near, missing, mode="edge")
-    distance, near = np.maximum(distance, 1e-300), np.ascontiguousarray(near)
+    np.maximum(distance, 1e-300, out=distance)
+    near = np.ascontiguousarray(near)
     spacing = distance[:, 5]
     unit = _quantiles(spacing, near, AROUND, (0.5,))[:, 0]
     planes, normals = _planes_of_all(points, near, unit)
+    around = _quantiles(spacing, near, NEIGHBORS, (0.1, 0.25, 0.75, 0.9))
     columns = [
-        np.log(distance[:, RANKS - 1] / unit[:, None]),
-        np.log(_quantiles(spacing, near, NEIGHBORS, (0.1, 0.25, 0.75, 0.9)) / unit[:, None]),
         *((np.bincount(near[:, :m].ravel(), minlength=len(points)) / m)[:, None] for m in LISTS),
         planes,
         _fellows_of_all(points, normals, near, unit),
         *(_outlier_factors(distance, near, m) for m in REACHES),
     ]
-    features: NDArray[np.float32] = np.clip(np.nan_to_num(np.hstack(columns)), -LIMIT, LIMIT).astype(np.float32)
+    features = np.empty((len(points), FEATURES), np.float32)
+
+    def put_together(part: slice) -> None:
+        lengths = np.log(np.hstack([distance[part][:, RANKS - 1], around[part]]) / unit[part, None])
+        found = np.hstack([lengths, *(column[part] for column in columns)])
+        features[part] = np.clip(np.nan_to_num(found, copy=False), -LIMIT, LIMIT)
+
+    _on_threads(put_together, len(points))
     return features
 
 
@@ -127,6 +134,7 @@ def _among_fellows(points: Floats, normals: Floats, near: Indices, unit: Floats,
 
 def _outlier_factors(distance: Floats, near: Indices, m: int) -> Floats:
     """Logarithm of the local outlier factor with m neighbors, and its usual and high values around."""
-    reach = np.maximum(distance[:, :m], distance[near[:, :m], m - 1]).mean(1)
-    factor = np.log(reach * (1 / reach)[near[:, :m]].mean(1))
+    near, farthest = np.ascontiguousarray(near[:, :m]), np.ascontiguousarray(distance[:, m - 1])
+    reach = np.maximum(distance[:, :m], farthest.take(near)).mean(1)
+    factor = np.log(reach * (1 / reach).take(near).mean(1))
     return np.column_stack([factor, _quantiles(factor, near, m, (0.5, 0.9))])
