@@ -13,7 +13,7 @@ from pnu.runtime.progress import Step, silent
 from pnu.runtime.threads import map_on_threads, thread_count
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
-ROWS = 2**18  # points whose neighbors are gathered at once: bounds the memory,
+ROWS = 2**16  # points whose neighbors are gathered at once: bounds the memory,
 CHUNK = 2**11  # or so many by a thread
 RANK = 12  # of the neighbor that a disc of seeds reaches
 AROUND = 8  # neighbors push a point
@@ -28,13 +28,14 @@ Floats = NDArray[np.float64]
 
 def tangent_discs(
     points: NDArray[np.floating], normals: NDArray[np.floating], count: int, *, rank: int = RANK,
-    first: int | None = None,
+    first: int | None = None, out: NDArray[np.floating] | None = None,
 ) -> NDArray[np.floating]:  # fmt: skip
     """Seeds on a disc around each point in its tangent plane, as wide as the rank-th neighbor is far.
 
-    points, normals (n, 3) -> (n, count, 3), or (first, count, 3) around the first points alone. Evenly spread by area
-    (a sunflower), turned from point to point and measured from the direction of the nearest neighbor: nothing is
-    random, and seeds turn and grow with the cloud. The discs overlap, so that seeds also lie in holes between points.
+    points, normals (n, 3) -> (n, count, 3), or (first, count, 3) around the first points alone, into `out` if given.
+    Evenly spread by area (a sunflower), turned from point to point and measured from the direction of the nearest
+    neighbor: nothing is random, and seeds turn and grow with the cloud. The discs overlap, so that seeds also lie in
+    holes between points.
     """
     rank = min(rank, len(points) - 1)
     kind: Any = points.dtype
@@ -47,7 +48,7 @@ def tangent_discs(
     along = _unit(np.where(short, _perpendicular(normals), along))
     across = np.cross(normals, along)
     seed = np.arange(count, dtype=kind)
-    discs = np.empty((len(points), count, 3), kind)
+    discs = np.empty((len(points), count, 3), kind) if out is None else out
     rows = max(ROWS // count, 1)
     for start in range(0, len(points), rows):
         part = slice(start, start + rows)
@@ -78,18 +79,18 @@ def repel(points: Floats, normals: Floats, *, steps: int, step: Step = silent, m
     order = along_curve(points)
     points, normals = points.take(order, 0), normals.take(order, 0)
     fixed = order >= (m if movable is None else movable)
-    distance, near = np.empty((m, k - 1)), np.empty((m, k - 1), np.int64)
+    usual, near = np.empty(m), np.empty((m, k - 1), np.int64)
     for _ in range(steps):
         tree = PointTree(points)
         for start in range(0, m, ROWS):
             part = slice(start, start + ROWS)
             dist_sq, idx = tree.nearest_sq(points[part], k, threads=thread_count(), ordered=True)
-            distance[part], near[part] = np.sqrt(dist_sq[:, 1:]), idx[:, 1:]
+            usual[part], near[part] = np.sqrt(dist_sq[:, 1 : USUAL + 1]).mean(1), idx[:, 1:]
             done += 1
             step(done, total)
-        usual = distance[:, :USUAL].mean(1)
+        del tree
         reach = np.full(m, REACH * np.quantile(usual, 0.5, method="lower"))
-        moved = pushed_apart(points, normals, near, distance, reach)
+        moved = pushed_apart(points, normals, near, reach)
         moved[fixed] = points[fixed]
         points = moved
     back = np.empty_like(points)
@@ -97,22 +98,23 @@ def repel(points: Floats, normals: Floats, *, steps: int, step: Step = silent, m
     return back
 
 
-def pushed_apart(points: Floats, normals: Floats, near: NDArray[np.int64], distance: Floats, reach: Floats) -> Floats:
-    """Where the first r of points (m, 3) go when their neighbors near (r, k), at a distance (r, k), push them in their
-    tangent planes, each within its reach (r,): (r, 3)."""
+def pushed_apart(points: Floats, normals: Floats, near: NDArray[np.int64], reach: Floats) -> Floats:
+    """Where the first r of points (m, 3) go when their neighbors near (r, k) push them in their tangent planes, each
+    within its reach (r,): (r, 3)."""
     moved, reach = np.empty((len(near), 3)), np.maximum(reach, LEAST)
     parts = [slice(start, start + CHUNK) for start in range(0, len(near), CHUNK)]
     if kernels.ready():
         from pnu.kernels.pushes import push_apart
 
-        arrays = [np.ascontiguousarray(values) for values in (points, normals, near, distance, reach)]
+        arrays = [np.ascontiguousarray(values) for values in (points, normals, near, reach)]
         map_on_threads(lambda part: push_apart(*arrays, part.start, moved[part]), parts)
         return moved
     for part in parts:
         here, idx, far = slice(part.start, min(part.stop, len(near))), near[part], reach[part, None]
         away = points[here, None] - points[idx]
+        distance = np.linalg.norm(away, axis=-1)
         facing = (normals[here, None] * normals[idx]).sum(-1) > FACING
-        force = np.maximum(1 - distance[part] / far, 0) * facing / np.maximum(distance[part], 1e-9 * far)
+        force = np.maximum(1 - distance / far, 0) * facing / np.maximum(distance, 1e-9 * far)
         push = 0.5 * far * (force[..., None] * away).sum(1)
         push -= (push * normals[here]).sum(-1, keepdims=True) * normals[here]
         longest = LONGEST * far

@@ -68,7 +68,7 @@ def farthest_in_blocks(
     """
     n = len(xyz)
     blocks = split_blocks(xyz, size or BLOCK)
-    of_block = np.concatenate(blocks.members)
+    of_block = np.concatenate(blocks.members)  # points in the order of the blocks
     xyz, blocks = xyz.take(of_block, 0), blocks.in_a_row()
     wanted = min(SURPLUS * m, n)
     done, total = 0, 2 * len(blocks.members)
@@ -101,7 +101,7 @@ def farthest_in_blocks(
             chosen, distance = _choose_all(xyz, blocks, reach, choose, pool, tick)
             surplus = len(chosen) / m
             if surplus >= 1 and (surplus <= CLOSE or attempt >= TRIES or len(chosen) == n):
-                return of_block[chosen[np.argsort(-distance, kind="stable")[:m]]]
+                return of_block[chosen[np.argsort(-distance, kind="stable")[:m]]].astype(np.int64)
             asked *= wanted / len(chosen)
     raise AssertionError
 

@@ -24,13 +24,13 @@ def farthest_points_large(points: NDArray[np.floating], m: int, *, step: Step = 
     linear in n. ValueError if m is not in 1..n.
     """
     check_count(m, len(points))
-    array = single_precision(points)
-    if len(array) <= LARGE or m < len(array) // LARGE_SHARE:
+    if len(points) <= LARGE or m < len(points) // LARGE_SHARE:
         step(0, 1)
-        chosen = farthest_order(array, m, 0)
+        chosen = farthest_order(single_precision(points), m, 0)
         step(1, 1)
         return chosen
-    return farthest_in_blocks(array, m, farthest_apart, threads=thread_count(), size=LARGE_BLOCK, step=step)
+    threads = thread_count()
+    return farthest_in_blocks(single_precision(points), m, farthest_apart, threads=threads, size=LARGE_BLOCK, step=step)
 
 
 def single_precision(points: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -134,7 +134,14 @@ def _among_fellows(points: Floats, normals: Floats, near: Indices, unit: Floats,
 
 def _outlier_factors(distance: Floats, near: Indices, m: int) -> Floats:
     """Logarithm of the local outlier factor with m neighbors, and its usual and high values around."""
-    near, farthest = np.ascontiguousarray(near[:, :m]), np.ascontiguousarray(distance[:, m - 1])
-    reach = np.maximum(distance[:, :m], farthest.take(near)).mean(1)
-    factor = np.log(reach * (1 / reach).take(near).mean(1))
+    farthest, reach, factor = np.ascontiguousarray(distance[:, m - 1]), np.empty(len(near)), np.empty(len(near))
+
+    def reaches(part: slice) -> None:
+        reach[part] = np.maximum(distance[part, :m], farthest.take(near[part, :m])).mean(1)
+
+    def factors(part: slice) -> None:
+        factor[part] = np.log(reach[part] * (1 / reach.take(near[part, :m])).mean(1))
+
+    _on_threads(reaches, len(near))
+    _on_threads(factors, len(near))
     return np.column_stack([factor, _quantiles(factor, near, m, (0.5, 0.9))])

@@ -52,19 +52,25 @@ class PointTree:
         if not self.compiled:
             dist, idx = self.plain.query(queries, k=np.arange(1, k + 1), workers=threads)
             return np.multiply(dist, dist, out=dist), idx
-        if not ordered and len(queries) > FEW:
-            order = self._order(queries)
-            back = np.empty_like(order)
-            back[order] = np.arange(len(order))
-            dist, idx = self.nearest_sq(queries.take(order, 0), k, threads=threads, ordered=True)
-            return dist.take(back, 0), idx.take(back, 0)
         dist, idx = np.empty((len(queries), k)), np.empty((len(queries), k), np.int64)
+        order = None if ordered or len(queries) <= FEW else self._order(queries)
+
+        def search(part: slice) -> None:
+            if order is None:
+                self.tree.search(queries[part], idx[part], dist[part])
+                return
+            rows = order[part]
+            near, far = np.empty((len(rows), k), np.int64), np.empty((len(rows), k))
+            self.tree.search(queries.take(rows, 0), near, far)
+            idx[rows], dist[rows] = near, far
+
         parts = [slice(start, start + CHUNK) for start in range(0, len(queries), CHUNK)]
         if threads == 1 or len(parts) < 2:
-            self.tree.search(queries, idx, dist)
+            for part in parts:
+                search(part)
             return dist, idx
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(lambda part: self.tree.search(queries[part], idx[part], dist[part]), parts))
+            list(pool.map(search, parts))
         return dist, idx
 
     def _order(self, queries: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Points = NDArray[np.floating]
-Index = NDArray[np.int64]
+Index = NDArray[np.signedinteger]
 
 CURVE = 16  # bits of a coordinate on the curve
 SPREAD_BITS = ((16, 0x0000FF0000FF), (8, 0x00F00F00F00F), (4, 0x0C30C30C30C3), (2, 0x249249249249))  # 1 bit in 3
@@ -22,9 +22,8 @@ class Blocks(NamedTuple):
     def in_a_row(self) -> "Blocks":
         """The same of the cloud whose points are put in the order of the blocks, so that those of each lie together."""
         stops = np.cumsum([len(part) for part in self.members])
-        return self._replace(
-            members=[np.arange(stop - len(part), stop) for part, stop in zip(self.members, stops, strict=True)]
-        )
+        rows = np.arange(stops[-1], dtype=self.members[0].dtype)
+        return self._replace(members=np.split(rows, stops[:-1]))
 
     def near(self, number: int, margin: float) -> list[int]:
         """Other blocks whose boxes are at most `margin` away, in each axis, from the box of a block."""
@@ -66,7 +65,8 @@ def split_blocks(points: Points, size: int) -> Blocks:
     """Blocks of at most `size` of the points (n, 3), by halving the longest side of the box, always at the median."""
     members: list[Index] = []
     boxes: list[tuple[Points, Points]] = []
-    todo = [(np.arange(len(points)), np.ascontiguousarray(points.T))]
+    kind = np.int32 if len(points) < 2**31 else np.int64
+    todo = [(np.arange(len(points), dtype=kind), np.ascontiguousarray(points.T))]
     while todo:
         part, axes = todo.pop()
         low, high = axes.min(1), axes.max(1)
@@ -80,7 +80,7 @@ def split_blocks(points: Points, size: int) -> Blocks:
     return Blocks(members, np.array([low for low, _ in boxes]), np.array([high for _, high in boxes]))
 
 
-def along_curve(points: Points) -> Index:
+def along_curve(points: Points) -> NDArray[np.int64]:
     """Order of the points (n, 3) along a Morton curve, (n,): what is near in the order is near in space, mostly.
 
     Searches and gathers in this order find in the processor's cache what the ones before have used.
@@ -96,7 +96,7 @@ def along_curve(points: Points) -> Index:
     return _stable_order(code)
 
 
-def _stable_order(code: Index) -> Index:
+def _stable_order(code: NDArray[np.int64]) -> NDArray[np.int64]:
     """As `code.argsort(kind="stable")` of (n,), in a third of the time where few are equal."""
     order = code.argsort()
     sorted_ = code.take(order)

@@ -41,7 +41,7 @@ CloudT = TypeVar("CloudT", "Floats", "Tensor")
 EVEN = 0.3  # standard deviation over mean of the nearest distance; 0.52 at random
 STILL_EVEN = 0.4  # so much where points were smoothed
 MOVED = 2.0  # smoothing moves points by so many times the noise at most, lest tips are drawn to the rest
-KEPT = 2**19  # queries whose projections are kept in one file
+KEPT = 2**18  # queries whose projections are kept in one file
 BATCH = 512  # queries at once on a CPU,
 BATCHES = 32  # of which its threads share so many
 AROUND = 8  # points of which one at most is dropped,
@@ -126,7 +126,7 @@ class SurfaceProjection:
         query = named("seeds", lambda step: seeds_around(cloud, each, candidates, step, first=first))
         if starts_on_spheres(network):
             to_sphere = partial(spheres, batch_size=context.batch_size)
-            query, _ = in_parts(to_sphere, query, cloud, workers=in_process, context=context, stage="spheres")
+            query = in_parts(to_sphere, query, cloud, workers=in_process, context=context, stage="spheres")[0]
         query = named("shortlist", lambda step: thin_between(query, some, kept, step))
         steps = [projections if left < network.fine else coarsely for left in range(network.refinements, -1, -1)]
         query, error = self.projected(query, cloud, context, "projection", steps[0])
@@ -204,10 +204,9 @@ def in_parts(
     on_cpu = str(context.device) == "cpu"
     size = queries_at_once(on_cpu, context.batch_size) * (BATCHES if on_cpu else 1)
     order = along_curve(query[:, :3])
-    query = query.take(order, 0)
 
     def project(first: int) -> Floats:
-        some = query[first : first + KEPT]
+        some = query.take(order[first : first + KEPT], 0)
         parts = [some[at : at + size] for at in range(0, len(some), size)]
         found = []
         for number, part in enumerate(workers.map(begin, cloud, parts), 1):
@@ -216,12 +215,13 @@ def in_parts(
         return np.concatenate(found)
 
     context.progress(stage, 0, len(query))
-    everything = np.empty((len(query), 7))
+    projected, error = np.empty((len(query), 6)), np.empty(len(query))  # apart: who wants one need not keep both
     for first in range(0, len(query), KEPT):
         found = context.parts.get(f"{stage}, {first} of {len(query)}", partial(project, first))
-        everything[order[first : first + KEPT]] = found
+        rows = order[first : first + KEPT]
+        projected[rows], error[rows] = found[:, :6], found[:, 6]
     context.progress(stage, len(query), len(query))
-    return everything[:, :6], everything[:, 6]
+    return projected, error
 
 
 def projections(network: Any, cloud: Floats, batch_size: int | None = None) -> Work:
@@ -307,10 +307,10 @@ def seeds_around(cloud: Floats, each: int, count: int, step: Step = silent, *, f
     """
     step(0, 1)
     first = len(cloud) if first is None else first
-    discs = tangent_discs(cloud[:, :3], cloud[:, 3:], each, first=first)
-    places = np.concatenate([cloud[:first, :3], discs.reshape(-1, 3)])
-    owner = np.concatenate([np.arange(first), np.arange(first).repeat(each)])
-    del discs
+    places = np.empty((first * (1 + each), 3))
+    places[:first] = cloud[:first, :3]
+    tangent_discs(cloud[:, :3], cloud[:, 3:], each, first=first, out=places[first:].reshape(first, each, 3))
+    owner = np.concatenate([np.arange(first, dtype=np.int32), np.arange(first, dtype=np.int32).repeat(each)])
     if first < len(cloud):
         own = _nearest(places, cloud[:, :3])[1] < first
         places, owner = places[own], owner[own]
@@ -319,7 +319,9 @@ def seeds_around(cloud: Floats, each: int, count: int, step: Step = silent, *, f
         step(1, 1)
     else:
         kept = farthest_points_large(places, count, step=step)
-    return np.hstack([places.take(kept, 0), cloud[owner[kept], 3:]])
+    seeds = np.empty((len(kept), 6))
+    seeds[:, :3], seeds[:, 3:] = places.take(kept, 0), cloud[owner[kept], 3:]
+    return seeds
 
 
 def no_farther(limit: float, points: Floats, moved: Floats) -> Floats:

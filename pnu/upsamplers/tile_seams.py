@@ -81,8 +81,8 @@ def evened_out(cloud: NDArray[np.float64], movable: int) -> NDArray[np.float64]:
     usual = distance[:, 1 : USUAL + 1].mean(1)
     reach = (REACH * np.median(usual[near], 1))[:movable]
     for _ in range(TURNS):
-        distance, near = PointTree(points).nearest(points[:movable], k)
-        points[:movable] = pushed_apart(points, normals, near[:, 1:], distance[:, 1:], reach)
+        near = PointTree(points).nearest(points[:movable], k)[1]
+        points[:movable] = pushed_apart(points, normals, near[:, 1:], reach)
     return np.hstack([points[:movable], normals[:movable]])
 
 

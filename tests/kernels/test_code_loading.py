@@ -14,7 +14,7 @@ import pytest
 from pnu.kernels import compilation
 from pnu.kernels.code_loading import DIGEST, Kernel, MachineCode, kernel_arguments, load_code
 
-PUSH = "void(float64[:, ::1], float64[:, ::1], int64[:, ::1], float64[:, ::1], float64[::1], int64, float64[:, ::1])"
+PUSH = "void(float64[:, ::1], float64[:, ::1], int64[:, ::1], float64[::1], int64, float64[:, ::1])"
 QUANTILES = "void(float64[::1], int64[:, ::1], int64, float64[::1], int64, float64[:, :])"
 ROWS_OF = "void(float32[:, ::1], int64, float32[:, ::1])"
 
@@ -231,7 +231,6 @@ def test_signatures_are_read() -> None:
         "float64[:, ::1]",
         "float64[:, ::1]",
         "int64[:, ::1]",
-        "float64[:, ::1]",
         "float64[::1]",
         "int64",
         "float64[:, ::1]",
