@@ -29,19 +29,19 @@ AT_ONCE = 50  # looked along at once
 CELL, BEHIND = 0.5, 3.0  # spacings across in which two points are on one ray, and along, from which one is behind
 CLEAR, SHARE = 0.02, 0.2  # of the points, and of the usual share, that may lie behind others
 ALIKE = 0.002  # directions that differ by less see the same
-NEAREST, FARTHEST = 1.2, 10.0  # radii of a cloud from its middle to a camera that saw it from outside
+NEAREST, FARTHEST = 1.05, 10.0  # radii of a cloud from its middle to a camera that saw it from outside
 BLOCK = 4096  # points in which pixels are looked for:
 SAME, SQUARE = 1.1, 1.35  # angles to the second and the fourth neighbor, over the nearest's, that are hardly wider,
 PAIRS, FOURS = 0.85, 0.7  # and the shares of the points that have them
 STEEP, FLAT = 0.95, 0.25  # of land: cosine of the way it was seen with z; height over its extent
 GLANCE = 512, 80  # points and directions of a first look for a camera somewhere,
 HIDDEN = 0.075  # share of points behind others above which there is none
-CLOSE = 0.03  # so much more than the least may be behind others in ways that are tried
-TRIED, STARTS = 20, 3  # ways that are tried, both of their ends, and those of them the search starts from
-AWAY, STEP = 2.8, 0.35  # radii to a camera at first, and by which the search begins to move it
+CLOSE = 0.06  # so much more than the least may be behind others in ways that are tried
+TRIED, STARTS = 30, 3  # ways that are tried, both of their ends, and those of them the search starts from
+AWAY, STEP = (1.6, 2.8), 0.35  # radii to a camera at first, and by which the search begins to move it
 WATCHED = 256  # points whose neighbors' angles are compared,
 WIDEST = 0.5  # logarithm by which one counts at most
-UNLIKELY, UNEVEN = 0.21, 0.07  # mean logarithm by which they differ, above which a way, or a place, is none to a camera
+UNLIKELY, UNEVEN = 0.23, 0.07  # mean logarithm by which they differ, above which a way, or a place, is none to a camera
 
 
 def is_camera(place: Floats, points: Floats) -> bool:
@@ -111,7 +111,7 @@ def _camera_of(data: bytes) -> Floats | None:
     ways = directions[behind <= behind.min() + CLOSE]
     if len(ways) > TRIED:
         ways = ways[farthest_points_large(ways, TRIED)]
-    starts = AWAY * np.concatenate([ways, -ways])
+    starts = np.concatenate([side * away * ways for side in (1, -1) for away in AWAY])
     block = unit if len(unit) <= MOST else unit[np.argpartition((unit**2).sum(1), MOST)[:MOST]]
 
     def unevenness(place: Floats, points: Floats = block) -> float:
