@@ -26,6 +26,7 @@ from pnu.runtime import threads
 from pnu.runtime.progress import Progress, Step, silent
 from pnu.runtime.workers import Begin, InProcess, Work, Workers
 from pnu.upsamplers.context import Context
+from pnu.upsamplers.coverage import Coverage
 from pnu.upsamplers.density import groups_of_like_spacing, point_counts
 
 if TYPE_CHECKING:
@@ -49,9 +50,7 @@ DOUBTFUL = 16  # looked for among so many for each point to drop
 DISTANT, RISKY = 8.0, 1.5  # weight of the distance from an even cloud, in spacings, beside the error; limit of both
 ROOM = 0.7  # around a point that is kept, in spacings that evenly spread points would have
 LONG = 10_000  # points made from which on a computation takes long enough to have kernels compiled beside it
-SPACED = 6  # neighbors whose mean distance is the spacing at a point of the cloud,
-COVERED = 0.5  # of which so much may lie between it and the nearest point made;
-NEARER, APPROACHES = 0.9, 3  # that comes to this share of it, again where another lost its own
+APPROACHES = 3  # times that points come nearer to those that have none near, as others lose their own by it
 MANY = 3, 2  # candidates and shortlist where points stay,
 FEW = 2, 1.15  # where none do, or where the surface goes on beyond a part
 CLOSE = 12  # neighbors of the sphere that candidates are first moved to
@@ -149,13 +148,14 @@ class SurfaceProjection:
 
         Where neither they nor those that are kept do, the nearest of them comes so near.
         """
+        query, coverage = query.copy(), Coverage(cloud[:, :3], query[:, :3], kept[:, :3])
         for number in range(1, APPROACHES + 1):
-            rows, places = approached(query[:, :3], kept[:, :3], cloud[:, :3])
+            rows, places = coverage.approach()
             if not len(rows):
                 break
             moved = np.hstack([places, query[rows, 3:]])
-            query = query.copy()
-            query[rows], _ = self.projected(moved, cloud, context, f"places without points, {number}")
+            query[rows] = self.projected(moved, cloud, context, f"places without points, {number}")[0]
+            coverage.move(rows, query[rows, :3])
         return query
 
     def projected(
@@ -367,25 +367,6 @@ def reject_worst(points: Floats, error: Floats, count: int) -> Index:
     stays = np.ones(len(points), bool)
     stays[np.concatenate([doubtful[worst], doubtful[~worst]])[:surplus]] = False
     return np.flatnonzero(stays)
-
-
-def approached(cloud: Floats, kept: Floats, points: Floats) -> tuple[Index, Floats]:
-    """Rows (k,) of a cloud (m, 3) to be moved, and where to (k, 3), for points (n, 3) that have none of it near.
-
-    Near is half of the spacing of the points; none of those that are kept (l, 3) lies there either. Each row moves
-    once, for the barest point.
-    """
-    around = PointTree(points).among_themselves(min(SPACED + 1, len(points)), threads=threads.thread_count())[0]
-    reach = COVERED * around.mean(1)
-    apart, row = _nearest(points, np.concatenate([cloud, kept]))
-    share = apart / np.maximum(reach, 1e-300)
-    bare = (-share).argsort(kind="stable")[: int((share > 1).sum())]
-    bare = bare[row[bare] < len(cloud)]  # what is kept does not move
-    _, barest = np.unique(row[bare], return_index=True)
-    bare = bare[np.sort(barest)]
-    to_point = points[bare] - cloud[row[bare]]
-    step = (apart[bare] - NEARER * reach[bare]) / np.maximum(apart[bare], 1e-300)
-    return row[bare], cloud[row[bare]] + step[:, None] * to_point
 
 
 def even_out(cloud: Floats, steps: int, step: Step = silent, kept: Floats | None = None) -> Floats:

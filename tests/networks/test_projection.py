@@ -18,7 +18,7 @@ from pnu.metrics.functional import uniformity
 from pnu.networks.surface import Projector, Surface
 from pnu.upsamplers import Context, SurfaceProjection
 from pnu.upsamplers import surface_projection as procedure
-from pnu.upsamplers.surface_projection import approached, no_farther, reject_worst, slid, within_reach
+from pnu.upsamplers.surface_projection import no_farther, reject_worst, slid, within_reach
 
 
 def upsample(network: Surface, cloud: Tensor, count: int, **options: Any) -> Tensor:
@@ -287,16 +287,6 @@ def test_count_is_exact_however_many_are_dropped(count: int) -> None:
     stays = torch.from_numpy(reject_worst(sphere(20)[:, :3].numpy(), np.arange(20.0)[::-1], count))
     assert len(stays) == count
     assert stays.equal(stays.unique())
-
-
-def test_the_nearest_comes_to_a_bare_point() -> None:
-    points = torch.stack([torch.arange(20.0), torch.zeros(20), torch.zeros(20)], 1).double()  # spacing 2 in the middle
-    cloud = torch.cat([points[:10] + torch.tensor([0.0, 0.1, 0.0]), points[13:]])
-    rows, places = approached(cloud.numpy(), cloud[:0].numpy(), points.numpy())
-    # 13 comes to nine tenths of half a spacing from 11, the barest; 9 comes nearer to 10
-    assert rows.tolist() == [10, 9]
-    assert np.linalg.norm(places[0] - points[11].numpy()) == pytest.approx(0.9)
-    assert approached(cloud.numpy(), points[11:13].numpy(), points.numpy())[0].tolist() == []
 
 
 def test_some_crops_in_training_get_normals_of_the_network_s_own() -> None:
