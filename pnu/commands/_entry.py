@@ -106,9 +106,8 @@ def command(function: Callable[[Any], Any], schema: type, name: str | None = Non
             return
         # before torch is there: on a busy machine, threads that spin while they wait make a step take seconds
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-        os.environ.setdefault(
-            "OPENBLAS_NUM_THREADS", "1"
-        )  # NumPy's products are small, and called from several threads
+        # NumPy's products are small and called from several threads, which would wait for each other
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         try:
             if arguments == ["--help"] and (cfg := written(config_folder() / f"{name}.yaml")) is not None:
                 print(help_text(schema, quoting.program(name), checked_config(cfg, schema, complete=False)))

@@ -90,7 +90,8 @@ def farthest_in_blocks(
             declines.append(decline)
             tick()
         reach = _common_distance(declines, wanted)
-        sparse = [number for number, decline in enumerate(declines) if decline.distance[-1] > reach]
+        # a sparse block gives more than its share: how many is to be seen, not guessed
+        sparse = [i for i, d in enumerate(declines) if d.distance[-1] > reach and d.number[-1] < d.most]
         full = pool.map(partial(alone, share=1.0), [blocks.members[number] for number in sparse])
         for number, decline in zip(sparse, full, strict=True):
             declines[number] = decline
@@ -155,10 +156,10 @@ def _choose_all(
             edge |= blocks.inside(own_places, other, reach)
             beside |= blocks.inside(places, other, 2 * reach)
         theirs = [chosen[other][blocks.inside(xyz.take(chosen[other], 0), number, reach)] for other in near]
-        taken, open_ = np.concatenate([mine[beside], *theirs]), own[edge]
-        if not len(open_) or not len(taken):
+        taken, left = np.concatenate([mine[beside], *theirs]), own[edge]
+        if not len(left) or not len(taken):
             return none, np.empty(0)
-        both = np.concatenate([taken, open_])
+        both = np.concatenate([taken, left])
         order, _ = choose(xyz.take(both, 0), len(both), given=len(taken), least=reach)
         added = both[order[len(taken) :]]
         return added, np.full(len(added), np.inf)
