@@ -217,8 +217,9 @@ def in_parts(
     context.progress(stage, 0, len(query))
     projected, error = np.empty((len(query), 6)), np.empty(len(query))  # apart: who wants one need not keep both
     for first in range(0, len(query), KEPT):
-        found = context.parts.get(f"{stage}, {first} of {len(query)}", partial(project, first))
         rows = order[first : first + KEPT]
+        name = f"{stage}, {first} to {first + len(rows)} of {len(query)}"  # which an older version may cut otherwise
+        found = context.parts.get(name, partial(project, first))
         projected[rows], error[rows] = found[:, :6], found[:, 6]
     context.progress(stage, len(query), len(query))
     return projected, error

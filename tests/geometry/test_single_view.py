@@ -139,7 +139,9 @@ def test_land_looks_up() -> None:
         assert settled.words == f"3000 estimated; side: {FROM_ABOVE}"
 
 
-@pytest.mark.parametrize(("name", "seed"), [("head", 0), ("nut", 1), ("dancer", 2), ("figure_eight", 0)])
+@pytest.mark.parametrize(
+    ("name", "seed"), [("head", 0), ("nut", 1), ("dancer", 2), ("figure_eight", 3), ("figure_eight", 0)]
+)
 def test_the_place_of_a_camera_is_found(name: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     scan = KINDS["oneview"](Scanner(shapes.make(name)), rng)

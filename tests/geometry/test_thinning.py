@@ -136,3 +136,5 @@ def test_near_along_the_curve_is_near_in_space() -> None:
     apart = cKDTree(points).query(points, k=2)[0][:, 1].mean()
     assert np.median(steps) < 3 * apart  # of a random order: about 7
     np.testing.assert_array_equal(along_curve(points[:1].repeat(5, 0)), np.arange(5))
+    repeated = np.concatenate([points, points])  # of equal ones the first comes first
+    np.testing.assert_array_equal(along_curve(repeated).reshape(-1, 2), order[:, None] + [0, len(points)])
