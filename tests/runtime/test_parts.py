@@ -59,6 +59,13 @@ def test_an_interrupted_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert ("projection", 512) not in seen
 
 
+def test_parts_that_another_version_cut_otherwise_do_no_harm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    points = sphere(300)
+    expected = upsample(points, points, parts=tmp_path, model="surface")
+    monkeypatch.setattr(surface_projection, "KEPT", 500)
+    np.testing.assert_array_equal(upsample(points, points, parts=tmp_path, model="surface"), expected)
+
+
 def test_parts_of_another_task_are_not_taken(tmp_path: Path) -> None:
     points = sphere(300)
     upsample(points, points, parts=tmp_path, model="surface")
