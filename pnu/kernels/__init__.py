@@ -12,7 +12,6 @@ missing, `PNU_FAST=0` is set, or the kernels are not compiled yet (`pnu.kernels.
 | `neighbors`, `greedy_sampling` | the k nearest points, and farthest point sampling |
 | `dipoles` | winding numbers and fields, from which orientation comes |
 | `planes` | fits to neighborhoods, and what tells stray points by them |
-| `local_means` | points drawn to where predictions of overlapping patches agree |
 | `pushes` | the step by which points push their neighbors apart |
 | `frames`, `projector` | the surface model: local frames and spheres; the network on them |
 """

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pnu.kernels.code_loading import MachineCode
 
 HERE = Path(__file__).parent
-KERNELS = ("boxes", "neighbors", "greedy_sampling", "frames", "projector", "dipoles", "planes", "local_means", "pushes")
+KERNELS = ("boxes", "neighbors", "greedy_sampling", "frames", "projector", "dipoles", "planes", "pushes")
 COMPLETE, LOCK, FAILED, CODE, NO_CODE = "complete", "lock", "failed", "code", "no_code"
 OLD = 30 * 86400  # seconds
 EXACT = {"nnan", "ninf", "nsz"}  # results have the bits of NumPy's operations in the order written

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,10 +13,26 @@ from pnu.runtime.threads import thread_count
 SPACED = 6  # neighbors whose mean distance is the spacing at a point of the cloud,
 COVERED = 0.5  # of which so much may lie between it and the nearest point made;
 NEARER = 0.9  # that comes to this share of it
+APPROACHES = 3  # times that points come nearer to those that have none near, as others lose their own by it
 AT_HAND = 16  # nearest points made among which one is looked for that has not moved
 
 Floats = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+
+def covering(made: Floats, kept: Floats, cloud: Floats, onto: Callable[[Floats, int], Floats]) -> Floats:
+    """Points made (m, 6) of which, or of those kept (k, 6), one lies within half a spacing of each point of a cloud.
+
+    Where none does, the nearest that was made comes so near; onto(points, number) brings them back onto the surface.
+    """
+    made, coverage = made.copy(), Coverage(cloud[:, :3], made[:, :3], kept[:, :3])
+    for number in range(1, APPROACHES + 1):
+        rows, places = coverage.approach()
+        if not len(rows):
+            break
+        made[rows] = onto(np.hstack([places, made[rows, 3:]]), number)
+        coverage.move(rows, made[rows, :3])
+    return made
 
 
 class Coverage:

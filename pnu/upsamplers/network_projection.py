@@ -35,9 +35,11 @@ def network_projections(network: Surface, cloud: Floats, size: Callable[[bool], 
     return _by_neighbors(project, cloud, network.reach, like.device, size)
 
 
-def network_spheres(network: Surface, cloud: Floats, k: int, size: Callable[[bool], int]) -> Callable[[Floats], Floats]:
-    """As `network_projections`, but to the sphere that fits the k nearest points, without expected error."""
-    like = network.projector.out.weight
+def sphere_projections(like: Tensor, cloud: Floats, k: int, size: Callable[[bool], int]) -> Callable[[Floats], Floats]:
+    """As `network_projections`, but to the sphere that fits the k nearest points, without expected error.
+
+    Computed in the type of `like`, where that lies.
+    """
 
     def project(query: Tensor, cloud: Tensor, idx: Tensor) -> Tensor:
         near = cloud[idx]

@@ -1,7 +1,6 @@
 """The paper's procedure (section Inference): patches through the network, farthest points of all predictions."""
 
 import math
-from collections.abc import Callable
 from functools import partial
 from numbers import Integral
 
@@ -10,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from pnu.geometry import patch_extraction
-from pnu.geometry.transforms import rotate, rotation_matrix
 from pnu.geometry.unit_sphere import unit_sphere_frame
 from pnu.runtime import threads
 from pnu.runtime.workers import Begin, InProcess, Work, Workers
@@ -21,7 +19,6 @@ from pnu.upsamplers.unit_normals import check_finite, with_unit_normals
 SMALLEST_PATCH = 64  # points that every network accepts; a smaller cloud is repeated up to it
 SLACK = 1.1  # growth beyond the network's ratio for which overlapping patches have points enough
 KEPT = 256  # patches whose predictions are kept in one file
-TURNS = 2  # orientations of a patch where predictions are to agree
 AT_ONCE = 1024  # points that go through a network together on a CPU, by one thread
 BATCHES = 32  # of these, that its threads share
 
@@ -33,9 +30,8 @@ class Patches:
     small cloud fills a patch by repetition. Nothing is random. The cloud stays on the CPU, in float64; patches go to
     the network in its own type and device.
 
-    With `merge="agreed"` of the context, ours, each patch is seen in two orientations, whose predictions differ, and
-    the farthest points are moved to where the predictions around them agree (`agreement`). A network without normals
-    has the orientations alone.
+    With `merge="agreed"` of the context, ours, the farthest points are moved to where the predictions around them agree
+    (`agreement`); those of a network without normals have the normals of the nearest input points for it.
 
     Args:
         network: with an attribute `ratio`.
@@ -61,8 +57,7 @@ class Patches:
     def upsample_cloud(self, cloud: Tensor, count: int, context: Context) -> Tensor:
         """cloud (n, 6) -> (count, 3 or 6) on the CPU."""
         cloud = cloud.cpu()
-        turns = TURNS if context.merge == "agreed" else 0
-        begin = partial(predictions, batch_size=context.batch_size, turns=turns)
+        begin = partial(predictions, batch_size=context.batch_size)
         run = partial(self._one_pass, begin, context.workers or InProcess(self.network), context)
         *before, last = self.pass_sizes(len(cloud), count)
         for size in before:
@@ -120,16 +115,15 @@ class Patches:
         context.progress(stage, len(idx), len(idx))
         stage = f"farthest points, {count} of {len(predicted)}"
         check_finite(predicted.numpy())
-        if context.merge == "agreed" and predicted.shape[1] >= 6:
-            agreed = most_agreed(predicted.double().numpy(), count, partial(context.progress, stage))
-            return torch.from_numpy(agreed)
+        if context.merge == "agreed":
+            given = with_unit_normals(predicted.double().numpy(), cloud.double().numpy())
+            agreed = most_agreed(given, cloud.double().numpy(), count, context, stage)
+            return torch.from_numpy(agreed[:, : predicted.shape[1]])
         return patch_extraction.merge(predicted[None], count, partial(context.progress, stage))
 
 
-def predictions(network: nn.Module, places: np.ndarray, batch_size: int | None = None, turns: int = 0) -> Work:
+def predictions(network: nn.Module, places: np.ndarray, batch_size: int | None = None) -> Work:
     """Of a cloud (n, 6): patches idx (p, size) -> their predictions, one after the other, in the cloud's frame.
-
-    Each patch as it lies, or in `turns` other orientations.
 
     On the CPU each thread works on patches of its own. That is faster than many threads in one operation, and the last
     digit of a matrix product, which may decide between two farthest points, depends on nothing else.
@@ -140,14 +134,8 @@ def predictions(network: nn.Module, places: np.ndarray, batch_size: int | None =
     def predict(idx: Tensor) -> Tensor:
         patch = cloud[idx]
         frame = unit_sphere_frame(patch)  # in float64, so that float32 has only the patch to resolve
-        unit = frame.to_unit(patch)
-        found = [run(unit)] if not turns else [turned(run, unit, orientations(idx, turn)) for turn in range(turns)]
-        dense: Tensor = frame.from_unit(torch.cat(found, 1))
+        dense: Tensor = frame.from_unit(network(frame.to_unit(patch).to(like)).cpu().double())
         return dense.flatten(0, 1)
-
-    def run(patch: Tensor) -> Tensor:
-        made: Tensor = network(patch.to(like)).cpu().double()
-        return made
 
     def work(rows: np.ndarray) -> np.ndarray:
         batches = torch.split(torch.from_numpy(rows), patches_at_once(like, batch_size, rows.shape[1]))
@@ -155,20 +143,6 @@ def predictions(network: nn.Module, places: np.ndarray, batch_size: int | None =
         return torch.cat(found).numpy()
 
     return work
-
-
-def orientations(idx: Tensor, turn: int) -> Tensor:
-    """Random rotations (p, 3, 3) of patches idx (p, size), which depend on the patch and the turn alone."""
-    drawn = [
-        rotation_matrix(1, generator=torch.Generator().manual_seed(TURNS * int(first) + turn), dtype=torch.float64)
-        for first in idx[:, 0]
-    ]
-    return torch.cat(drawn)
-
-
-def turned(run: Callable[[Tensor], Tensor], patch: Tensor, rotation: Tensor) -> Tensor:
-    """What `run` makes of patches (p, size, 6) that are turned, turned back."""
-    return rotate(run(rotate(patch, rotation)), rotation.transpose(1, 2))
 
 
 def example(network: nn.Module) -> Tensor:

@@ -26,7 +26,7 @@ from pnu.runtime import threads
 from pnu.runtime.progress import Progress, Step, silent
 from pnu.runtime.workers import Begin, InProcess, Work, Workers
 from pnu.upsamplers.context import Context
-from pnu.upsamplers.coverage import Coverage
+from pnu.upsamplers.coverage import covering
 from pnu.upsamplers.density import groups_of_like_spacing, point_counts
 
 if TYPE_CHECKING:
@@ -50,7 +50,6 @@ DOUBTFUL = 16  # looked for among so many for each point to drop
 DISTANT, RISKY = 8.0, 1.5  # weight of the distance from an even cloud, in spacings, beside the error; limit of both
 ROOM = 0.7  # around a point that is kept, in spacings that evenly spread points would have
 LONG = 10_000  # points made from which on a computation takes long enough to have kernels compiled beside it
-APPROACHES = 3  # times that points come nearer to those that have none near, as others lose their own by it
 MANY = 3, 2  # candidates and shortlist where points stay,
 FEW = 2, 1.15  # where none do, or where the surface goes on beyond a part
 CLOSE = 12  # neighbors of the sphere that candidates are first moved to
@@ -140,23 +139,12 @@ class SurfaceProjection:
             query, error = query[near], error[near]
         query = query[reject_worst(query[:, :3], error, new)]
         if first == len(cloud):  # of a part others make what lies at its borders
-            query = self.covering(query, kept, cloud, context)
+            query = covering(query, kept, cloud, partial(self._nearer, cloud=cloud, context=context))
         return np.concatenate([self.with_normals(kept, cloud, context), query]) if len(kept) else query
 
-    def covering(self, query: Floats, kept: Floats, cloud: Floats, context: Context) -> Floats:
-        """Points (m, 6) of which one lies within half a spacing of each point of a cloud (n, 6).
-
-        Where neither they nor those that are kept do, the nearest of them comes so near.
-        """
-        query, coverage = query.copy(), Coverage(cloud[:, :3], query[:, :3], kept[:, :3])
-        for number in range(1, APPROACHES + 1):
-            rows, places = coverage.approach()
-            if not len(rows):
-                break
-            moved = np.hstack([places, query[rows, 3:]])
-            query[rows] = self.projected(moved, cloud, context, f"places without points, {number}")[0]
-            coverage.move(rows, query[rows, :3])
-        return query
+    def _nearer(self, moved: Floats, number: int, cloud: Floats, context: Context) -> Floats:
+        """Points (k, 6) that came nearer to those that had none near, on the surface again."""
+        return self.projected(moved, cloud, context, f"places without points, {number}")[0]
 
     def projected(
         self, query: Floats, cloud: Floats, context: Context, stage: str, begin: Callable[..., Work] | None = None
@@ -250,9 +238,10 @@ def spheres(network: Any, cloud: Floats, batch_size: int | None = None) -> Work:
     """As `projections`, but to the sphere that fits the nearest points, without network and expected error."""
     cloud = cloud[along_curve(cloud[:, :3])]
     if _compiled(network) is None:
-        from pnu.upsamplers.network_projection import network_spheres
+        from pnu.upsamplers.network_projection import sphere_projections
 
-        return network_spheres(network, cloud, CLOSE, partial(queries_at_once, batch_size=batch_size))
+        like = network.projector.out.weight
+        return sphere_projections(like, cloud, CLOSE, partial(queries_at_once, batch_size=batch_size))
     return by_neighbors(compiled_feet, cloud, CLOSE, batch_size)
 
 

@@ -56,7 +56,6 @@ compilation.machine_code = lambda: None
 from pnu import weights
 from pnu.geometry import even_spacing, farthest_sampling, normal_estimation, orientation, outlier_features, point_tree
 from pnu.networks.compiled_surface import compiled_feet, compiled_step
-from pnu.upsamplers import agreement
 modules = [importlib.import_module(f"pnu.kernels.{name}") for name in compilation.KERNELS]
 found = weights.read(weights.find("surface"), "numpy").state
 both = [
@@ -80,7 +79,6 @@ def results():
     yield outlier_features.outlier_features(points)
     yield normal_estimation.estimate_normals(points, orient=False)
     yield normal_estimation.refit_normals(points, normals)
-    yield agreement.agreed(query, cloud)
     yield orientation._Pairs(near, np.sqrt(near.area)).inverse_cubes
     yield orientation._dipoles(near, lines, 1.4)
     yield orientation._Pairs(near, np.sqrt(near.area)).winding(lines)

@@ -261,7 +261,7 @@ def test_most_doubtful_points_are_dropped(monkeypatch: pytest.MonkeyPatch) -> No
         return found
 
     monkeypatch.setattr(procedure, "in_parts", spy)
-    monkeypatch.setattr(SurfaceProjection, "covering", lambda self, query, *others: query)
+    monkeypatch.setattr(procedure, "covering", lambda query, *others: query)
     dense = upsample(model, cloud, 600)
     points, error = every["last"]
     assert len(points) == 606
