@@ -1,16 +1,21 @@
 """Tables of an evaluation: terminal, JSON, CSV."""
 
+from __future__ import annotations
+
 import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pnu.benchmark.measuring import Row
 from pnu.io import atomic_path, check_writable, write_json
 from pnu.metrics import METRICS, Metric, Shown
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 COSTS = (
     Shown("seconds", "seconds", "s", unit="seconds", form=".2f"),
@@ -22,6 +27,7 @@ LEGEND = (
     "of the surface. floor: another Poisson-disk sampling of the true surface, as dense as the output."
 )
 REFERENCES = ("floor", "input")
+WIDTH, WIDEST = 118, 1000  # letters of a table's line: even if a terminal has fewer, and at most
 
 
 def legend(rows: Iterable[Row], metrics: Sequence[Metric] = METRICS) -> str:
@@ -73,23 +79,21 @@ def over_seeds(rows: Iterable[Row], metrics: Sequence[Metric] = METRICS) -> list
 
 def print_over_seeds(rows: Sequence[Row], metrics: Sequence[Metric] = METRICS) -> None:
     """A table for each kind of input, where there are runs that differ in their seed alone."""
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console(width=max(Console().width, 118), highlight=False)
     found = over_seeds(rows, metrics)
     for kind in dict.fromkeys(row["kind"] for row in found):
         of_kind = [row for row in found if row["kind"] == kind]
         all_shown = columns([row for row in rows if row["kind"] == kind], metrics)
         table = Table(title=f"{kind}: mean ± standard deviation over seeds", title_justify="left", title_style="bold")
-        for head in ("method", "seeds"):
-            table.add_column(head)
+        table.add_column("method", overflow="fold")  # never cut: names may differ in their ends alone
+        table.add_column("seeds")
         for shown in all_shown:
             table.add_column(shown.head or shown.title, justify="right")
         for row in of_kind:
             cells = (f"{row_cell(row, s)} ± {s.text(row.get(f'{s.name}_std'))}" for s in all_shown)
             table.add_row(row["method"], str(row["seeds"]), *cells)
-        console.print(table)
+        show(table)
 
 
 def print_tables(rows: Sequence[Row], head: str, metrics: Sequence[Metric] = METRICS) -> None:
@@ -97,14 +101,14 @@ def print_tables(rows: Sequence[Row], head: str, metrics: Sequence[Metric] = MET
     from rich.console import Console
     from rich.table import Table
 
-    console = Console(width=max(Console().width, 118), highlight=False)
+    console = Console(width=max(Console().width, WIDTH), highlight=False)
     summaries = summarize(rows, metrics)
     for kind in dict.fromkeys(row["kind"] for row in rows):
         of_kind = [row for row in rows if row["kind"] == kind]
         all_shown = columns(of_kind, metrics)
         table = Table(title=f"{kind}: {counts(of_kind)}", title_justify="left", title_style="bold")
-        table.add_column("method")
-        table.add_column("shape")
+        for head in ("method", "shape"):
+            table.add_column(head, overflow="fold")
         for shown in all_shown:
             table.add_column(shown.head or shown.title, justify="right")
         for summary in sorted((s for s in summaries if s["kind"] == kind), key=lambda s: s["method"] in REFERENCES):
@@ -118,8 +122,17 @@ def print_tables(rows: Sequence[Row], head: str, metrics: Sequence[Metric] = MET
             table.add_row(
                 "", "spread", *(row_cell(spread, shown) for shown in all_shown), style="dim", end_section=True
             )
-        console.print(table)
+        show(table)
     console.print(f"{head.rstrip('.')}. {legend(rows, metrics)}\n")
+
+
+def show(table: Table) -> None:
+    """Print a table: on a terminal with columns as narrow as they must be, else as wide as it is."""
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    needed = WIDTH if console.is_terminal else Console(width=WIDEST).measure(table).maximum
+    Console(width=max(console.width, WIDTH, needed), highlight=False).print(table)
 
 
 def counts(rows: Sequence[Row]) -> str:

@@ -235,6 +235,23 @@ def test_spread_over_seeds_by_hand(capsys: pytest.CaptureFixture[str]) -> None:
     assert "5.0000 ± 3.6056" in capsys.readouterr().out
 
 
+def test_names_are_not_cut_in_tables_of_many_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    names = ["loss_terms_no_normal", "loss_terms_no_normal_knn", "loss_terms_no_normal_orth"]
+    values = {metric.shown.name: 0.123 for metric in metrics.METRICS} | {"seconds": 1.5, "peak_memory_mb": 600.0}
+    rows = [
+        {"shape": "a_shape_with_a_name", "kind": "random", "method": f"{name}_seed-{seed}"} | values
+        for name in names
+        for seed in range(2)
+    ]
+    benchmark.print_over_seeds(rows)
+    shown = capsys.readouterr().out
+    assert all(f" {name} " in shown for name in names)
+    points = {"points_in": 1, "points_out": 4, "frame": "truth"}
+    benchmark.print_tables([row | points for row in rows], "head")
+    shown = capsys.readouterr().out
+    assert all(f" {row['shape']} " in shown and row["method"] in shown for row in rows)
+
+
 def test_cost_sees_memory_and_children() -> None:
     with cost.Cost() as small:
         pass
