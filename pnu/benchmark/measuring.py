@@ -124,8 +124,8 @@ def network_upsampler(
     if not patches:  # what is compared beside networks of patches has none to merge
         options.pop("merge", None)
     kept: Any = {"true": True, "false": False}.get(str(keep).lower(), keep)
-    if kept is True and not isinstance(model, str) and not getattr(upsamplers.upsampler_of(model), "follows", False):
-        raise ValueError(f"keep=true: {name} spreads all points anew; give it to surface alone")
+    if kept is True and not isinstance(model, str) and not getattr(upsamplers.upsampler_of(model), "keeps", False):
+        raise ValueError(f"keep=true: {name} spreads all points anew; leave it out")
 
     def upsampler(points: np.ndarray, normals: np.ndarray | None) -> np.ndarray:
         return whole_clouds.upsample(points, normals, ratio=ratio, model=model, keep=kept, **options)

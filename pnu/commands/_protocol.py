@@ -17,7 +17,10 @@ MERGE = (
     "of networks of patches: farthest: the farthest points of all predictions, as in the paper; agreed: where the "
     "predictions of overlapping patches, each in two orientations, agree"
 )
-KEEP = "of surface: true: the points given are in the result, unmoved; false: all are new; auto: as pnu upsample"
+KEEP = (
+    "of surface and networks of patches: true: the points given are in the result, unmoved; false: all are new; "
+    "auto: as pnu upsample"
+)
 
 
 def protocol_source(cfg: Any) -> tuple["Protocol", "CaseSource"]:

@@ -42,8 +42,8 @@ class Upsample:
         "of surface: even; follow: every point becomes as many; auto: even where no place loses points by it"
     )
     keep: str = doc(
-        "of surface: true: the points read are among those written, unmoved; false: all are new; "
-        "auto: kept where evenly spread and without noise"
+        "of surface and networks of patches: true: the points read are among those written, unmoved; false: all are "
+        "new; auto: surface keeps them where evenly spread and without noise"
     )
     normals: str = doc(_sides.NORMALS)
     viewpoint: str | None = doc(_sides.VIEWPOINT)

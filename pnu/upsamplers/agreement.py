@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnu import kernels
-from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.networks.compiled_surface import compiled_feet
 from pnu.runtime.workers import InProcess, Work
 from pnu.upsamplers.context import Context
 from pnu.upsamplers.coverage import covering
-from pnu.upsamplers.surface_projection import by_neighbors, even_out, in_parts, queries_at_once
+from pnu.upsamplers.surface_projection import by_neighbors, even_out, in_parts, queries_at_once, thin_between
 
 NEIGHBORS = 144  # predictions that a sphere fits: where four patches overlap, those of nine points of the cloud
 ROUNDS = 2  # times that the points chosen first move to spheres
@@ -23,27 +22,26 @@ RELAXATION = 2  # times that points spread, and move to spheres once more
 Floats = NDArray[np.float64]
 
 
-def most_agreed(predicted: Floats, cloud: Floats, count: int, context: Context, stage: str) -> Floats:
+def most_agreed(predicted: Floats, cloud: Floats, kept: Floats, count: int, context: Context, stage: str) -> Floats:
     """Points and unit normals (count, 6) where predictions (m, 6) of a cloud (n, 6) agree, both with unit normals.
 
     Farthest points of the predictions move to algebraic spheres through the predictions around them, are thinned out,
     and spread evenly on what these say; so errors across the surface, which differ from patch to patch, cancel. Where
-    none comes to lie near a point of the cloud, the nearest does.
+    none comes to lie near a point of the cloud, the nearest does. Points kept (k, 6) leave the places around them free.
     """
     more = min(max(count, round(SURPLUS * count)), len(predicted))
-    first = farthest_points_large(predicted[:, :3], more, step=partial(context.progress, stage))
     fit = InProcess(None)  # one for all, so that their tree is made once
 
     def moved(points: Floats, stage: str) -> Floats:
         return in_parts(agreeing_spheres, points, predicted, workers=fit, context=context, stage=stage)[0]
 
-    chosen = predicted[first]
+    chosen = thin_between(predicted, more, kept, partial(context.progress, stage))
     for number in range(1, ROUNDS + 1):
         chosen = moved(chosen, f"agreement {number}")
-    chosen = chosen[farthest_points_large(chosen[:, :3], count)]
+    chosen = thin_between(chosen, count, kept)
     for number in range(1, RELAXATION + 1):
-        chosen = moved(even_out(chosen, 1), f"even spacing {number}")
-    return covering(chosen, chosen[:0], cloud, lambda points, number: moved(points, f"places without points, {number}"))
+        chosen = moved(even_out(chosen, 1, kept=kept), f"even spacing {number}")
+    return covering(chosen, kept, cloud, lambda points, number: moved(points, f"places without points, {number}"))
 
 
 def agreeing_spheres(network: Any, predicted: Floats) -> Work:

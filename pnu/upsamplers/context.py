@@ -60,6 +60,6 @@ class Upsampler(Protocol):
 
         Both in the unit sphere, where `pnu.upsample` brings clouds, in float64; the normals that come out may have any
         length. An upsampler with an attribute `parallel` that is true gives work to `context.workers`,
-        one with `follows` minds `context.density` and `context.keep`, one with `merges` `context.merge`.
+        one with `follows` minds `context.density`, one with `keeps` `context.keep`, one with `merges` `context.merge`.
         """
         ...

@@ -14,6 +14,7 @@ from pnu.runtime import threads
 from pnu.runtime.workers import Begin, InProcess, Work, Workers
 from pnu.upsamplers.agreement import most_agreed
 from pnu.upsamplers.context import Context
+from pnu.upsamplers.surface_projection import thin_between
 from pnu.upsamplers.unit_normals import check_finite, with_unit_normals
 
 SMALLEST_PATCH = 64  # points that every network accepts; a smaller cloud is repeated up to it
@@ -31,7 +32,8 @@ class Patches:
     the network in its own type and device.
 
     With `merge="agreed"` of the context, ours, the farthest points are moved to where the predictions around them agree
-    (`agreement`); those of a network without normals have the normals of the nearest input points for it.
+    (`agreement`); the normals of a network without are estimated for it. With `keep` the input points come first, and
+    the farthest points are those from them, too.
 
     Args:
         network: with an attribute `ratio`.
@@ -41,7 +43,7 @@ class Patches:
         ValueError: the network has no ratio.
     """
 
-    parallel = merges = True
+    parallel = merges = keeps = True
 
     def __init__(self, network: nn.Module, patch_size: int | None = None) -> None:
         self.network = network
@@ -58,7 +60,10 @@ class Patches:
         """cloud (n, 6) -> (count, 3 or 6) on the CPU."""
         cloud = cloud.cpu()
         begin = partial(predictions, batch_size=context.batch_size)
-        run = partial(self._one_pass, begin, context.workers or InProcess(self.network), context)
+        kept = cloud if context.keep else cloud[:0]
+        if count <= len(kept):
+            return kept[:count]
+        run = partial(self._one_pass, begin, context.workers or InProcess(self.network), context, kept)
         *before, last = self.pass_sizes(len(cloud), count)
         for size in before:
             dense = run(cloud, size).double().numpy()
@@ -81,8 +86,13 @@ class Patches:
             sizes.append(min(math.ceil(n * (count / n) ** (i / passes)), self.ratio * sizes[-1]))
         return [*sizes[1:], count]
 
-    def _one_pass(self, begin: Begin, workers: Workers, context: Context, cloud: Tensor, count: int) -> Tensor:
-        """The network on patches of the cloud (n, 6), and farthest points of all it predicts: (count, 3 or 6)."""
+    def _one_pass(
+        self, begin: Begin, workers: Workers, context: Context, kept: Tensor, cloud: Tensor, count: int
+    ) -> Tensor:
+        """The network on patches of the cloud (n, 6), and farthest points of all it predicts: (count, 3 or 6).
+
+        The first are those kept (k, 6).
+        """
         n, size = len(cloud), min(self.patch_size, len(cloud))
         centers = 1 if size == n else max(1, round(self.ratio * n / size))
         stage = f"network, {n} points"
@@ -115,11 +125,16 @@ class Patches:
         context.progress(stage, len(idx), len(idx))
         stage = f"farthest points, {count} of {len(predicted)}"
         check_finite(predicted.numpy())
+        given, columns = cloud.double().numpy(), predicted.shape[1]
+        stay, new = kept.double().numpy(), count - len(kept)
         if context.merge == "agreed":
-            given = with_unit_normals(predicted.double().numpy(), cloud.double().numpy())
-            agreed = most_agreed(given, cloud.double().numpy(), count, context, stage)
-            return torch.from_numpy(agreed[:, : predicted.shape[1]])
-        return patch_extraction.merge(predicted[None], count, partial(context.progress, stage))
+            all_predicted = with_unit_normals(predicted.double().numpy(), given)
+            made = most_agreed(all_predicted, given, stay, new, context, stage)
+        elif len(kept):
+            made = thin_between(predicted.double().numpy(), new, stay, partial(context.progress, stage))
+        else:
+            return patch_extraction.merge(predicted[None], count, partial(context.progress, stage))
+        return torch.from_numpy(np.concatenate([stay[:, :columns], made[:, :columns]]))
 
 
 def predictions(network: nn.Module, places: np.ndarray, batch_size: int | None = None) -> Work:

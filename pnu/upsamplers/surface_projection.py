@@ -63,7 +63,7 @@ class SurfaceProjection:
     """
 
     parallel = True
-    follows = True
+    follows = keeps = True
 
     def __init__(self, network: Network) -> None:
         self.network = network

@@ -148,8 +148,9 @@ def upsample(
             the time.
         density: of the points of "surface". "even" over the surface; "follow": each point becomes `ratio`; "auto": even
             where no place loses points by it, elsewhere those that it has.
-        keep: of "surface". True: the points given are among those that come out, first and unmoved, and new ones fill
-            between; False: all are new; "auto": kept where they are evenly spread and show no noise.
+        keep: of "surface" and networks of patches. True: the points given are among those that come out, first and
+            unmoved, and new ones fill between; False: all are new; "auto": "surface" keeps them where they are evenly
+            spread and show no noise.
         outliers: "auto": stray points are taken out first, and not counted less for it: n stays; "keep": none is.
         lines: "auto": scan lines, dense along and sparse across, are thinned out first; "keep": they stay.
         signs: "auto": where given normals contradict each other, their axes are kept and their sides chosen anew;
@@ -215,12 +216,12 @@ def upsample(
         raise ValueError(f"merge=agreed: {type(network).__name__} has no patches that overlap; leave it out")
     names = _names(target, devices)
     sparse, frame = _prepare(cleaned, progress, refine=not getattr(network, "passes", 0))
-    if not getattr(upsampler, "follows", False) and (density == "follow" or keep is True):
-        asked = "density=follow" if density == "follow" else "keep=true"
+    follows, can_keep = (getattr(upsampler, name, False) for name in ("follows", "keeps"))
+    if (density == "follow" and not follows) or (keep is True and not can_keep):
+        asked = "density=follow" if density == "follow" and not follows else "keep=true"
         raise ValueError(
             f"{asked}: {type(network).__name__} spreads new points evenly; take model surface (run=surface)"
         )
-    follows = getattr(upsampler, "follows", False)
     even = follows and keep == "auto" and is_even(sparse)
     clean = even and noise_in_spacings(sparse) < FAINT
     keeps = clean if keep == "auto" else keep

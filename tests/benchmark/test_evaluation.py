@@ -192,7 +192,7 @@ def test_rows_with_the_points_given_in_them() -> None:
     assert len(kept) == len(new) == 600
     np.testing.assert_array_equal(kept[:300, :3], points)
     assert not np.isin(points[:, 0], new[:, 0]).any()
-    with pytest.raises(ValueError, match="keep=true: midpoint spreads all points anew; give it to surface alone"):
+    with pytest.raises(ValueError, match="keep=true: midpoint spreads all points anew; leave it out"):
         benchmark.network_upsampler(classical("midpoint"), 2, keep="true", name="midpoint")
     with pytest.raises(ValueError, match="keep=maybe: expected true, false or auto"):
         benchmark.network_upsampler("surface", 2, keep="maybe")(points, points)

@@ -31,7 +31,7 @@ def ball(number: int, noise: float, seed: int = 0) -> np.ndarray:
 
 
 def agreeing(predicted: np.ndarray, count: int) -> np.ndarray:
-    return most_agreed(predicted, predicted[:: len(predicted) // 100], count, Context(), "agreement")
+    return most_agreed(predicted, predicted[:: len(predicted) // 100], predicted[:0], count, Context(), "agreement")
 
 
 def test_errors_across_the_surface_cancel_and_its_two_sides_stay_apart() -> None:
@@ -107,7 +107,7 @@ def test_a_point_of_the_cloud_without_any_near_gets_one() -> None:
 
     spacing = np.sort(np.linalg.norm(cloud[:, :3] - cloud[0, :3], axis=1))[1:7].mean()
     assert bare(predicted) > 0.5 * spacing
-    found = most_agreed(predicted, cloud, 2400, Context(), "agreement")
+    found = most_agreed(predicted, cloud, cloud[:0], 2400, Context(), "agreement")
     assert bare(found) < 0.5 * spacing
     assert np.abs(np.linalg.norm(found[:, :3], axis=1) - 1).max() < 1e-3
 
@@ -149,6 +149,21 @@ def test_what_differs_from_patch_to_patch_goes(columns: int) -> None:
     order = np.random.default_rng(1).permutation(600)
     again = pnu.upsample(unit[order, :3], unit[order, 3:], model=Shifted(columns), merge="agreed")
     np.testing.assert_allclose(again, one, atol=1e-6)
+
+
+@pytest.mark.parametrize("columns", [6, 3])
+@pytest.mark.parametrize("merge", ["farthest", "agreed"])
+@pytest.mark.parametrize("ratio", [1, 3, 16])
+def test_points_that_are_kept_come_first_and_others_between(merge: str, columns: int, ratio: int) -> None:
+    unit = ball(300, 0)
+    dense = pnu.upsample(unit[:, :3], unit[:, 3:], model=Shifted(columns), merge=merge, keep=True, ratio=ratio)
+    assert dense.shape == (300 * ratio, 6)
+    np.testing.assert_array_equal(dense[:300, :3], unit[:, :3])
+    np.testing.assert_allclose(dense[:300, 3:], unit[:, 3:], atol=1e-12)
+    if ratio > 1:
+        apart = cKDTree(unit[:, :3]).query(dense[300:, :3])[0]
+        new = pnu.upsample(unit[:, :3], unit[:, 3:], model=Shifted(columns), merge=merge, ratio=ratio)
+        assert np.quantile(apart, 0.01) > 1.5 * np.quantile(cKDTree(unit[:, :3]).query(new[:, :3])[0], 0.01)
 
 
 @pytest.mark.parametrize("length", [0, np.nan, np.inf])
