@@ -1,6 +1,7 @@
 """The paper's procedure (section Inference): patches through the network, farthest points of all predictions."""
 
 import math
+from dataclasses import replace
 from functools import partial
 from numbers import Integral
 
@@ -117,7 +118,7 @@ class Patches:
 
         predicted = torch.empty(0)
         for first in range(0, len(idx), KEPT):
-            found = torch.from_numpy(context.parts.get(f"{stage}, patch {first}", partial(predict, first)))
+            found = torch.from_numpy(context.parts.get(f"{stage}, patches from {first}", partial(predict, first)))
             each = len(found) // min(KEPT, len(idx) - first)  # points of a patch
             if not first:
                 predicted = found.new_empty(len(idx) * each, found.shape[1])
@@ -129,7 +130,8 @@ class Patches:
         stay, new = kept.double().numpy(), count - len(kept)
         if context.merge == "agreed":
             all_predicted = with_unit_normals(predicted.double().numpy(), given)
-            made = most_agreed(all_predicted, given, stay, new, context, stage)
+            of_pass = replace(context, parts=context.parts.within(f"agreement_{n}"))
+            made = most_agreed(all_predicted, given, stay, new, of_pass, stage)
         elif len(kept):
             made = thin_between(predicted.double().numpy(), new, stay, partial(context.progress, stage))
         else:

@@ -1,5 +1,7 @@
 """Where overlapping predictions agree: what moves, where to, and what stays."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -164,6 +166,14 @@ def test_points_that_are_kept_come_first_and_others_between(merge: str, columns:
         apart = cKDTree(unit[:, :3]).query(dense[300:, :3])[0]
         new = pnu.upsample(unit[:, :3], unit[:, 3:], model=Shifted(columns), merge=merge, ratio=ratio)
         assert np.quantile(apart, 0.01) > 1.5 * np.quantile(cKDTree(unit[:, :3]).query(new[:, :3])[0], 0.01)
+
+
+def test_parts_of_each_pass_are_kept_and_taken_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    unit, options = ball(300, 0), {"model": Shifted(), "merge": "agreed", "ratio": 16}
+    whole = pnu.upsample(unit[:, :3], unit[:, 3:], **options)
+    np.testing.assert_array_equal(pnu.upsample(unit[:, :3], unit[:, 3:], parts=tmp_path, **options), whole)
+    monkeypatch.setattr(Shifted, "forward", None)
+    np.testing.assert_array_equal(pnu.upsample(unit[:, :3], unit[:, 3:], parts=tmp_path, **options), whole)
 
 
 @pytest.mark.parametrize("length", [0, np.nan, np.inf])
