@@ -7,9 +7,11 @@ from numbers import Integral
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from pnu.geometry import patch_extraction
+from pnu.geometry.normal_estimation import flip_to_reference
 from pnu.geometry.unit_sphere import unit_sphere_frame
 from pnu.runtime import threads
 from pnu.runtime.workers import Begin, InProcess, Work, Workers
@@ -20,9 +22,11 @@ from pnu.upsamplers.unit_normals import check_finite, with_unit_normals
 
 SMALLEST_PATCH = 64  # points that every network accepts; a smaller cloud is repeated up to it
 SLACK = 1.1  # growth beyond the network's ratio for which overlapping patches have points enough
+UNSIDED = 0.25  # share of predicted normals against the nearest given ones from which on their sides mean nothing
 KEPT = 256  # patches whose predictions are kept in one file
 AT_ONCE = 1024  # points that go through a network together on a CPU, by one thread
 BATCHES = 32  # of these, that its threads share
+Floats = NDArray[np.float64]
 
 
 class Patches:
@@ -129,7 +133,7 @@ class Patches:
         given, columns = cloud.double().numpy(), predicted.shape[1]
         stay, new = kept.double().numpy(), count - len(kept)
         if context.merge == "agreed":
-            all_predicted = with_unit_normals(predicted.double().numpy(), given)
+            all_predicted = with_agreeing_sides(with_unit_normals(predicted.double().numpy(), given), given)
             of_pass = replace(context, parts=context.parts.within(f"agreement_{n}"))
             made = most_agreed(all_predicted, given, stay, new, of_pass, stage)
         elif len(kept):
@@ -137,6 +141,16 @@ class Patches:
         else:
             return patch_extraction.merge(predicted[None], count, partial(context.progress, stage))
         return torch.from_numpy(np.concatenate([stay[:, :columns], made[:, :columns]]))
+
+
+def with_agreeing_sides(predicted: Floats, cloud: Floats) -> Floats:
+    """Predictions (m, 6) of a network that does not learn sides, as PUGeo-Net, with those of the nearest normals.
+
+    cloud (n, 6). Others stay as they are: on a thin sheet the nearest point may lie on its other side.
+    """
+    sided = flip_to_reference(predicted[:, 3:], predicted[:, :3], cloud[:, :3], cloud[:, 3:])
+    turned = (sided != predicted[:, 3:]).any(1).mean()
+    return np.hstack([predicted[:, :3], sided]) if turned > UNSIDED else predicted
 
 
 def predictions(network: nn.Module, places: np.ndarray, batch_size: int | None = None) -> Work:

@@ -134,6 +134,19 @@ class Shifted(nn.Module):
         return found[..., : self.columns].flatten(1, 2)
 
 
+def test_sides_that_a_network_does_not_learn_are_those_of_the_input() -> None:
+    class Unsided(Shifted):
+        def forward(self, patch: Tensor) -> Tensor:
+            found = super().forward(patch)
+            side = (1e4 * found[..., :1]).sin().sign()
+            return torch.cat([found[..., :3], side * found[..., 3:]], -1)
+
+    unit = ball(600, 0)
+    found, sided = (pnu.upsample(unit[:, :3], unit[:, 3:], model=m, merge="agreed") for m in (Unsided(), Shifted()))
+    np.testing.assert_allclose(found, sided, atol=1e-9)
+    assert ((found[:, 3:] * found[:, :3]).sum(1) > 0).all()
+
+
 @pytest.mark.parametrize("columns", [6, 3])
 def test_what_differs_from_patch_to_patch_goes(columns: int) -> None:
     unit = ball(600, 0)
