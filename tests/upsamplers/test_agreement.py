@@ -185,6 +185,8 @@ def test_parts_of_each_pass_are_kept_and_taken_up(tmp_path: Path, monkeypatch: p
     unit, options = ball(300, 0), {"model": Shifted(), "merge": "agreed", "ratio": 16}
     whole = pnu.upsample(unit[:, :3], unit[:, 3:], **options)
     np.testing.assert_array_equal(pnu.upsample(unit[:, :3], unit[:, 3:], parts=tmp_path, **options), whole)
+    # apart, lest as many points of another pass be taken for them
+    assert len({path.parent for path in tmp_path.rglob("agreement 1*")}) == 2
     monkeypatch.setattr(Shifted, "forward", None)
     np.testing.assert_array_equal(pnu.upsample(unit[:, :3], unit[:, 3:], parts=tmp_path, **options), whole)
 
