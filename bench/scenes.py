@@ -1,6 +1,8 @@
-"""Scenes whose normals are known: land with houses, a room, a corridor. Points and unit normals (n, 3) each."""
+"""Scenes whose normals are known: land, a yard, rooms, a corridor. Points and unit normals (n, 3) each."""
 
 import numpy as np
+
+from pnu.geometry.sphere_directions import sphere_directions
 
 Array = np.ndarray
 FACES = [(axis, side) for axis in range(3) for side in (-1, 1)]  # of a box
@@ -41,6 +43,37 @@ def land(noise: float = 0.0) -> tuple[Array, Array]:
     points = [np.stack([x, y, height(x, y)], 1)[kept], *points]
     cloud = np.vstack(points)
     return cloud + noise * rng.normal(size=cloud.shape), np.vstack([slope[kept], *normals])
+
+
+def yard() -> tuple[Array, Array]:
+    """Ground of 20 by 20 meters with three houses, evenly sampled as far as it is seen from its middle."""
+    ground, up = box(5000, (20, 20, 1), (0, 0, -0.5), [(2, 1)])
+    points, normals, kept = [], [], np.ones(len(ground), bool)
+    for place, size in (((7, 6.5), (6, 5, 6)), ((-7.3, 0.5), (1.5, 11, 3.8)), ((-2, -6), (2, 2, 3))):
+        kept &= (np.abs(ground[:, :2] - place) > np.array(size[:2]) / 2).any(1)
+        area = 2 * (size[0] + size[1]) * size[2] + size[0] * size[1]
+        house, outward = box(round(13 * area), size, (*place, size[2] / 2), FACES[:4] + FACES[5:])
+        points.append(house)
+        normals.append(outward)
+    cloud, facing = np.vstack([ground[kept], *points]), np.vstack([up[kept], *normals])
+    seen = ((np.array([0, 0, 1.6]) - cloud) * facing).sum(1) > 0
+    return cloud[seen], facing[seen]
+
+
+def scanned_room(place: Array, rays: int = 6000) -> tuple[Array, Array]:
+    """Of six by four by three meters with a ball, as a scanner at a place (3,) in it sees it, but not steeply."""
+    size, ball, radius = np.array([6.0, 4, 3]), np.array([4.5, 1, 1]), 0.6
+    ways = sphere_directions(rays)
+    ways = ways[np.abs(ways[:, 2]) < 0.9]
+    reach = (np.where(ways > 0, size, 0.0) - place) / ways
+    far, normals = reach.min(1), -np.sign(ways) * np.eye(3)[reach.argmin(1)]
+    along = ways @ (ball - place)
+    root = along**2 - ((ball - place) ** 2).sum() + radius**2
+    hit = (root > 0) & (along > 0)
+    far[hit] = (along - np.sqrt(np.maximum(root, 0)))[hit]
+    points = place + far[:, None] * ways
+    normals[hit] = (points[hit] - ball) / radius
+    return points, normals
 
 
 def room() -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ import numpy as np
 import open3d
 
 import pnu
-from bench.scenes import corridor, land, room
+from bench.scenes import corridor, land, room, scanned_room, yard
 from pnu.benchmark.cases import generator
 from pnu.data import shapes
 from pnu.data.scanner import KINDS, Scanner
@@ -47,6 +47,8 @@ def cases(meshes: Path, seed: int) -> Iterator[Case]:
     rng = np.random.default_rng(seed)
     for name, (points, true), sight in (
         ("land with houses, from the air", land(0.1), {"up": np.array([0.0, 0, 1])}),
+        ("yard with houses, from its middle", yard(), {"viewpoint": np.array([0, 0, 1.6])}),
+        ("scanned room, from inside", scanned_room(np.array([2, 2.4, 1.5])), {"viewpoint": np.array([2, 2.4, 1.5])}),
         ("room with a chest and a pillar, from inside", room(), {"viewpoint": np.array([0, -1, 1.5])}),
         ("corridor, from one end", corridor(), {"viewpoint": np.array([-3, 0, 0.2])}),
     ):

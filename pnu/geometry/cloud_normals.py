@@ -9,7 +9,8 @@ from pnu.geometry.cloud_statistics import CONTRADICTING, contradicting
 from pnu.geometry.flipped_parts import flipped_share
 from pnu.geometry.normal_estimation import complete_normals, orient_normals
 from pnu.geometry.normal_sides import repaired_signs, seen_signs
-from pnu.geometry.orientation import NeighborCloud, is_closed
+from pnu.geometry.orientation import NeighborCloud, gauss_law
+from pnu.geometry.scanner_within import scanner_within
 from pnu.geometry.single_view import camera_place, is_camera, seen_from_one_side
 from pnu.geometry.unit_sphere import unit_sphere_frame
 from pnu.io.sensor import Sight
@@ -20,7 +21,10 @@ Refine = Callable[[np.ndarray, np.ndarray, Progress], np.ndarray]
 """points (n, 3) in the unit sphere, rough normals (n, 3) whose sides agree -> better ones (n, 3)."""
 OUTWARD = "outward, by the winding field"
 ONE_SIDE, FROM_ABOVE = "to where all of it was seen from, one side", "up, as land that was seen from above"
+GROUND = "up, as ground and what stands on it"
 UP = np.array([0.0, 0.0, 1.0])
+LEVEL = 0.7  # height of the mean normal of what is mostly ground
+AGAINST = 0.2  # as much may Gauss' law speak for the other side: things on a ground are open below
 
 
 class Settled(NamedTuple):
@@ -73,6 +77,9 @@ def settled_normals(
     if refine is not None and not known.all():
         lines = np.where(known[:, None], lines, refine(unit, lines, progress))
     sight = asked or found or sight_by_places(points)
+    if sight is None and (anew[known].any() or not known.any()):
+        place = scanner_within(unit, lines)
+        sight = None if place is None else scanner_sight(frame.from_unit(place[None])[0])
     if sight is not None and sight.viewpoint is not None:
         of_each = sight.viewpoint.ndim == 2
         places = sight.viewpoint[order] if of_each else sight.viewpoint
@@ -118,6 +125,12 @@ def camera_sight(place: np.ndarray) -> Sight:
     return Sight(f"towards a {camera_words(place)}, whose pixels they are", viewpoint=place, pixels=True)
 
 
+def scanner_sight(place: np.ndarray) -> Sight:
+    """That of a scanner amid the points whose place (3,) was found."""
+    where = ",".join(f"{value:.3g}" for value in place)
+    return Sight(f"towards a scanner within, at about {where}, from which they thin out", viewpoint=place)
+
+
 def camera_words(place: np.ndarray) -> str:
     """Such a camera and about where it is."""
     return f"camera at {','.join(f'{value:.3g}' for value in place) if place.any() else 'the origin'}"
@@ -145,16 +158,28 @@ def _signs(
         sign, by = repaired_signs(unit, lines)
         return sign, OUTWARD if by == "outward" else "that of most given"
     oriented = orient_normals(unit, lines) if known.any() else lines
-    closed = is_closed(NeighborCloud.of(unit), oriented.astype(np.float32))
-    # plates too thin to lie behind themselves are closed all the same
-    facing = None if closed else seen_from_one_side(unit, oriented)
-    oriented = oriented if facing is None else facing.normals
+    oriented, by = _by_shape(unit, oriented)
     sign = np.where((oriented * lines).sum(1) < 0, -1.0, 1.0)
     if sight is not None:
         return (-sign if sight.inward else sign), sight.words
-    if facing is not None:
-        return sign, FROM_ABOVE if facing.above else ONE_SIDE
-    return sign, OUTWARD if closed else "one and the same over an open surface"
+    return sign, by
+
+
+def _by_shape(unit: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, str]:
+    """Normals (n, 3) whose sides agree, on the side that the shape tells, and how it does, in words."""
+    cloud = NeighborCloud.of(unit)
+    law = gauss_law(cloud, normals.astype(np.float32))
+    if law.closed:
+        return normals, OUTWARD
+    view = seen_from_one_side(unit, normals)  # plates too thin to lie behind themselves are closed all the same
+    if view is not None and view.above:
+        return view.normals, FROM_ABOVE
+    facing = normals if view is None else view.normals
+    height = float(cloud.area @ facing[:, 2] / cloud.area.sum())  # of the mean normal
+    outward = law.outward * np.sign(((normals * facing).sum(1) * cloud.area).sum() * height)
+    if abs(height) > LEVEL and outward > -AGAINST:
+        return facing * np.sign(height), GROUND
+    return facing, "one and the same over an open surface" if view is None else ONE_SIDE
 
 
 def _words(known: np.ndarray, turned: int, why: str, side: str) -> str:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pnu.geometry.connected_parts import connected_parts
-from pnu.geometry.orientation import SOME_NOISE, NeighborCloud, field, is_closed, signs
+from pnu.geometry.orientation import SOME_NOISE, NeighborCloud, field, gauss_law, signs
 from pnu.geometry.point_tree import PointTree
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def seen_signs(
         way = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-300)
     seen = np.nan_to_num((lines * way).sum(1))
     if viewpoint is not None and np.ndim(viewpoint) == 1 and not surely:
-        seen[_hidden(points, lines, np.asarray(viewpoint, np.float64))] = 0
+        seen[hidden(points, lines, np.asarray(viewpoint, np.float64))] = 0
     return voted_signs(points, lines, seen, surely=surely or viewpoint is None)
 
 
@@ -121,7 +121,7 @@ def repaired_signs(points: np.ndarray, normals: np.ndarray) -> Repair:
     outward = (field(cloud, given * sign[:, None], SOME_NOISE) * given).sum(1).astype(np.float64)
     pairs = Couplings.of(points, normals)
     found = _patchwise(pairs, outward)
-    if is_closed(cloud, given * found.astype(np.float32)[:, None]):
+    if gauss_law(cloud, given * found.astype(np.float32)[:, None]).closed:
         return Repair(-found, "most") if (found > 0).mean() < 1 - MOST else Repair(found, "outward")
     part = connected_parts(pairs.first, pairs.second, len(points))
     found = _turned(pairs, found, np.zeros(len(points)), part)[0]
@@ -227,20 +227,23 @@ def _bodies(piece: np.ndarray, pairs: Couplings, agree: np.ndarray) -> np.ndarra
     return connected_parts(held.row[firm], held.col[firm], count)
 
 
-def _hidden(points: np.ndarray, lines: np.ndarray, viewpoint: np.ndarray) -> np.ndarray:
+def hidden(
+    points: np.ndarray, lines: np.ndarray, viewpoint: np.ndarray, spacing: np.ndarray | None = None
+) -> np.ndarray:
     """Which of the points (n, 3) lie behind others, seen from there, (n,): those that face away too, as far as they are
-    farther from the others than their tangent planes say.
+    farther from the others than their tangent planes say. `spacing` (n,) is theirs, if it is known.
 
     Directions are sorted into cells, finer and finer; in each the nearest of the points that cover a cell hides others.
     """
     ray = points - viewpoint
     distance = np.linalg.norm(ray, axis=1)
     ray /= np.maximum(distance, 1e-300)[:, None]
-    spacing = PointTree(points).among_themselves(min(6, len(points)))[0].mean(1)
+    if spacing is None:
+        spacing = PointTree(points).among_themselves(min(6, len(points)))[0].mean(1)
     angle = np.clip(COVERED * spacing / np.maximum(distance, 1e-300), 2.0**-16, 1)
     level = np.floor(-np.log2(angle)).astype(int)
     far_first = np.argsort(-distance, kind="stable")
-    hidden = np.zeros(len(points), bool)
+    behind_others = np.zeros(len(points), bool)
     for fineness in np.unique(level):
         covers = far_first[level[far_first] <= fineness]
         for shift in (0.0, 0.5):
@@ -254,5 +257,5 @@ def _hidden(points: np.ndarray, lines: np.ndarray, viewpoint: np.ndarray) -> np.
                 np.abs((step * lines).sum(1)) / np.maximum(spacing, 1e-300),
                 np.abs((step * lines[other]).sum(1)) / np.maximum(spacing[other], 1e-300),
             )
-            hidden |= (other >= 0) & (distance[other] < distance) & (behind > DEEP)
-    return hidden
+            behind_others |= (other >= 0) & (distance[other] < distance) & (behind > DEEP)
+    return behind_others

@@ -100,14 +100,27 @@ def signs(cloud: NeighborCloud, lines: Array) -> Array:
     return sign
 
 
-def is_closed(cloud: NeighborCloud, normals: Array) -> bool:
-    """Whether oriented normals (n, 3) bound something: as far as Gauss' law holds at an even subset of the points."""
+class GaussLaw(NamedTuple):
+    """What the winding number at oriented points says of the shape."""
+
+    misfit: float  # of 1/2 or -1/2 at each, relative: 0 on a closed shape
+    outward: float  # its mean over 1/2: 1 where normals look outward, -1 inward, about 0 on sheets
+
+    @property
+    def closed(self) -> bool:
+        """Whether the points bound something, as far as the law holds."""
+        return self.misfit <= OPEN
+
+
+def gauss_law(cloud: NeighborCloud, normals: Array) -> GaussLaw:
+    """Of oriented normals (n, 3), at an even subset of the points where they are many."""
     if len(normals) > ANCHORS:
         chosen = farthest_points_large(cloud.points, ANCHORS)
         cloud, normals = NeighborCloud.of(cloud.points[chosen]), normals[chosen]
     weight = np.sqrt(cloud.area)
-    winding = _Pairs(cloud, weight).winding(normals * weight[:, None])
-    return bool(np.linalg.norm(np.abs(winding) - 0.5 * weight) <= OPEN * np.linalg.norm(0.5 * weight))
+    winding, half = _Pairs(cloud, weight).winding(normals * weight[:, None]), f32(0.5) * weight
+    misfit = np.linalg.norm(np.abs(winding) - half) / np.linalg.norm(half)
+    return GaussLaw(float(misfit), float((winding * half).sum() / (half * half).sum()))
 
 
 def _global_signs(cloud: NeighborCloud, lines: Array) -> tuple[Array, Array]:

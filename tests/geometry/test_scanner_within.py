@@ -1,0 +1,81 @@
+"""Where a scanner stood amid what it saw is known by how the points thin out, and normals look there."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+import pnu
+from bench.scenes import scanned_room, yard
+from pnu.data import shapes
+from pnu.data.scanner import KINDS, Scanner
+from pnu.geometry.cloud_normals import GROUND, settled_normals
+from pnu.geometry.normal_estimation import complete_normals
+from pnu.geometry.scanner_within import scanner_within
+
+Array = NDArray[np.float64]
+SIZE = np.array([6.0, 4.0, 3.0])  # of the scanned room
+PLACE = np.array([2.0, 2.4, 1.5])
+
+
+def even_room(n: int = 6000) -> Array:
+    """As many points of the same walls, the same everywhere."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, SIZE, (4 * n, 3))
+    axis = rng.choice(3, 4 * n, p=(1 / SIZE) / (1 / SIZE).sum())
+    points[np.arange(4 * n), axis] = np.where(rng.random(4 * n) < 0.5, 0, SIZE[axis])
+    return points[:n]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_place_is_found_however_the_room_lies(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    turn, shift, scale = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3), 10 ** rng.uniform(-3, 3)
+    points, normals = scanned_room(PLACE + rng.uniform(-0.5, 0.5, 3) * seed)
+    place = PLACE if seed == 0 else None
+    order = rng.permutation(len(points))
+    signs = rng.choice([-1.0, 1.0], (len(points), 1))  # lines have no side
+    found = scanner_within(scale * (points @ turn.T + shift)[order], (signs * normals @ turn.T)[order])
+    assert found is not None
+    found = (found / scale - shift) @ turn
+    if place is not None:
+        assert np.linalg.norm(found - place) < 0.15
+    assert (found > 0).all()
+    assert (found < SIZE).all()
+
+
+def test_walls_look_into_the_room_and_the_ball_looks_out() -> None:
+    points, normals = scanned_room(PLACE)
+    assert ((pnu.normals(points) * normals).sum(1) > 0).mean() > 0.98
+    settled = settled_normals(points, None)
+    assert ((settled.normals * normals).sum(1) > 0).mean() > 0.98
+    assert "scanner within, at about" in settled.side
+
+
+def test_the_same_room_sampled_evenly_is_a_box_that_looks_outward() -> None:
+    points = even_room()
+    assert scanner_within(points, complete_normals(points, None, 16)) is None
+    outward = (pnu.normals(points) * (points - SIZE / 2)).sum(1)
+    assert (outward > 0).mean() > 0.98
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ["mug", "teddy", "nut"])
+def test_none_is_found_in_what_was_scanned_from_outside(name: str, kind: str) -> None:
+    points = KINDS[kind](Scanner(shapes.make(name)), np.random.default_rng(1)).points
+    place = scanner_within(points, complete_normals(points, None, 16))
+    if kind != "oneview":  # whose camera is outside of the points
+        assert place is None
+
+
+def test_few_points_and_equal_ones_tell_nothing() -> None:
+    points, normals = scanned_room(PLACE, rays=900)
+    assert scanner_within(points, normals) is None
+    assert scanner_within(np.zeros((2000, 3)), np.tile([0.0, 0.0, 1.0], (2000, 1))) is None
+
+
+def test_ground_and_what_stands_on_it_look_up_and_out() -> None:
+    points, normals = yard()
+    settled = settled_normals(points, None)
+    assert ((settled.normals * normals).sum(1) > 0).mean() > 0.98
+    assert settled.side == GROUND
