@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from pnu.cleaning.outliers import MANY, stray_points
 from pnu.geometry.anisotropy import averaged, thinned_lines
-from pnu.geometry.cloud_normals import camera_sight, camera_words, contradiction, settled_normals
+from pnu.geometry.cloud_normals import Settled, camera_sight, camera_words, contradiction, settled_normals
 from pnu.geometry.noise_level import noise_level
 from pnu.geometry.single_view import camera_place
 from pnu.geometry.spacing import spacing
@@ -32,7 +32,7 @@ class Cleaned(NamedTuple):
     cloud: Cloud  # its notes say what was done
     stray: NDArray[np.int64]  # rows of the cloud before that were taken out as stray
     character: Character = "clean"  # of a cloud without normals; what has them is "clean"
-    estimated: NDArray[np.float64] | None = None  # normals (n, 3) of the cloud, where they had to be known to tell
+    estimated: Settled | None = None  # rough normals of a cloud that has none, where they are known
     camera: NDArray[np.float64] | None = None  # place (3,) from which all of a cloud without normals was seen
 
     @property
@@ -88,8 +88,8 @@ def clean_cloud(
         return scanned._replace(character="scanned")
     if not is_noisy(cloud.points):  # nor has it thin walls, whose sides normals tell apart
         return scanned
-    estimated = settled_normals(cloud.points, None, found=found.sight).normals
-    if is_noisy(cloud.points, estimated):
+    estimated = settled_normals(cloud.points, None, found=found.sight)
+    if is_noisy(cloud.points, estimated.normals):
         return found._replace(character=noisy_character(cloud.points), estimated=estimated)
     return scanned._replace(estimated=estimated)
 

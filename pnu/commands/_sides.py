@@ -5,10 +5,8 @@ from typing import TYPE_CHECKING, Any
 from pnu.runtime.progress import stages
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from pnu.cleaning import Cleaned
+    from pnu.geometry.cloud_normals import Settled
     from pnu.io import Cloud
     from pnu.io.sensor import Sight
 
@@ -33,16 +31,15 @@ def check_sides(cfg: Any) -> None:
         raise ValueError(f"{name}={cfg[name]}: decides nothing where normals=keep; take normals=orient")
 
 
-def sided(cfg: Any, cloud: "Cloud", *, learned: bool = True, places: "Sight | None" = None) -> tuple["Cloud", str]:
-    """A cloud with a normal for each point, as the keys and the file say, and a line on them, which is the last of its
-    notes where something was done. Without `learned` those that are estimated are plane fits. places: what those of the
-    points say, where that is known already."""
+def sided(cfg: Any, cloud: "Cloud", *, learned: bool = True, places: "Sight | None" = None) -> "Settled":
+    """A normal for each point of a cloud, as the keys and the file say. Without `learned` those that are estimated are
+    plane fits. places: what those of the points say, where that is known already."""
     from pnu.geometry.cloud_normals import settled_normals
     from pnu.io.sensor import asked_sight, sight_of
     from pnu.upsamplers.learned_normals import learned_normals
 
     with stages(cfg.quiet) as progress:
-        settled = settled_normals(
+        return settled_normals(
             cloud.points,
             cloud.normals,
             choice=cfg.normals,
@@ -51,15 +48,18 @@ def sided(cfg: Any, cloud: "Cloud", *, learned: bool = True, places: "Sight | No
             refine=learned_normals if learned else None,
             progress=progress,
         )
-    line = f"normals: {settled.words}"
-    return cloud._replace(normals=settled.normals, notes=(*cloud.notes, *[line] * bool(settled.side))), line
 
 
-def cleaned(cfg: Any, cloud: "Cloud", **treatments: Any) -> tuple["Cleaned", "NDArray[np.float64] | None"]:
-    """A cloud as `clean_cloud` leaves it, and the normals of its own that it then has.
+def with_normals(cloud: "Cloud", settled: "Settled") -> "Cloud":
+    """A cloud with these, and a line on them as its last note where something was done."""
+    notes = (*cloud.notes, *[f"normals: {settled.words}"] * bool(settled.side))
+    return cloud._replace(normals=settled.normals, notes=notes)
 
-    Where keys or file say more of the side of normals than the shape of the cloud does, or where estimates are known,
-    each point has a normal.
+
+def cleaned(cfg: Any, cloud: "Cloud", **treatments: Any) -> tuple["Cleaned", "Cloud"]:
+    """A cloud as `clean_cloud` leaves it, and the same with a normal for each point, its own or rough estimates.
+
+    Where keys or file say more of the side of normals than the shape of the cloud does, they decide it.
     """
     from pnu.cleaning import clean_cloud
     from pnu.geometry.cloud_normals import sight_by_places
@@ -69,9 +69,10 @@ def cleaned(cfg: Any, cloud: "Cloud", **treatments: Any) -> tuple["Cleaned", "ND
     places = sight_by_places(cloud.points)
     told = told or sight_of(cfg.input, cloud.attributes) is not None or places is not None
     found = clean_cloud(cloud, **treatments, signs="keep" if told or cfg.normals == "keep" else "auto")
-    own = found.cloud.normals
-    if told:
-        found = found._replace(cloud=sided(cfg, found.cloud, learned=False, places=places)[0])
-    elif found.estimated is not None and str(cfg.get("keep")).lower() != "true":  # points kept get the network's
-        found = found._replace(cloud=found.cloud._replace(normals=found.estimated))
-    return found, own
+    own = found.cloud.normals is not None
+    if own and not told:
+        return found, found.cloud
+    settled = found.estimated if found.estimated is not None and not told else None
+    settled = settled or sided(cfg, found.cloud, learned=False, places=places)
+    whole = with_normals(found.cloud, settled)
+    return (found._replace(cloud=whole) if own else found._replace(estimated=settled)), whole

@@ -85,7 +85,8 @@ def read_and_clean(scan: str, keys: Mapping[str, Any]) -> tuple["Cloud", "Cleane
     given = [override(key, value) for key, value in ({"input": scan, "output": "dense.ply"} | dict(keys)).items()]
     cfg = compose_config(Upsample, given)
     before = io.read_cloud(scan, normals=cfg.normals != "estimate", columns=cfg.columns)
-    return before, _sides.cleaned(cfg, before, outliers=cfg.outliers, lines=cfg.lines)[0]
+    cleaned, cloud = _sides.cleaned(cfg, before, outliers=cfg.outliers, lines=cfg.lines)
+    return before, cleaned._replace(cloud=cloud)
 
 
 def run_command(verb: str, arguments: list[str], tell: Tell) -> None:

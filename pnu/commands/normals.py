@@ -45,9 +45,9 @@ def normals(cfg: Any) -> None:
     say(f"input:   {cfg.input}, {len(cloud.points)} points, {'without' if cloud.normals is None else 'with'} normals")
     for note in cloud.notes:
         say(f"         {note}")
-    cloud, line = _sides.sided(cfg, cloud)
-    say(line)
-    for note in io.write_cloud(cfg.output, cloud.points, cloud.normals, cloud.attributes):
+    settled = _sides.sided(cfg, cloud)
+    say(f"normals: {settled.words}")
+    for note in io.write_cloud(cfg.output, cloud.points, settled.normals, cloud.attributes):
         say(f"         {note}")
     say(f"output:  {cfg.output}, {len(cloud.points)} points with unit normals, {time.perf_counter() - started:.1f} s")
     say(f"next:    {shell_line('upsample', input=cfg.output, output='dense.ply')}")

@@ -68,10 +68,10 @@ def reconstruct(cfg: Any) -> None:
         if holes := open_edges(truth):
             warn(f"{cfg.truth}: is not watertight ({holes} open edges); errors are large where surface is missing")
         reconstruction.check_frame(points, truth, name=cfg.input, truth_name=cfg.truth)
-    settled, _ = _sides.sided(cfg, cloud)
-    for note in settled.notes[len(cloud.notes) :]:
-        say(f"        {note}")
-    normals = np.asarray(settled.normals)
+    settled = _sides.sided(cfg, cloud)
+    if settled.side:
+        say(f"        normals: {settled.words}")
+    normals = settled.normals
     for text in describe_cloud(points, normals).warnings():
         warn(text)
     depth = reconstruction.octree_depth(points) if cfg.depth is None else cfg.depth

@@ -68,22 +68,22 @@ def scan(cfg: Any) -> None:
 
     wanted = cfg.ratio if cfg.spacing is None else whole_clouds.ratio_of_spacing(before.points, cfg.spacing)
     count = whole_clouds.output_count(len(before.points), wanted)
-    (cloud, stray, character, *_), own = _sides.cleaned(cfg, before)
+    cleaned, cloud = _sides.cleaned(cfg, before)
+    stray = cleaned.stray
     look = describe_cloud(cloud.points, cloud.normals)
     for text in (*cloud.notes, str(look), *look.warnings()):
         say(f"        {text}")
     if cfg.removed is not None:
         gone = {name: values[stray] for name, values in before.attributes.items()}
         io.write_cloud(cfg.removed, before.points[stray], None, gone)
-    network = LoadedWeights("surface").network(own, character)
+    network = LoadedWeights("surface").network(cleaned.cloud.normals, cleaned.character)
     for name, value in QUALITIES[cfg.quality].items():
         setattr(network, name, value)
     device = "cpu" if is_cpu("auto") else "cuda"
     with stages(cfg.quiet) as progress:
-        dense = whole_clouds.upsample(
-            cloud.points, cloud.normals, ratio=count / len(cloud.points), outliers="keep", lines="keep", signs="keep",
-            model=network, device=device, holes=cfg.holes, seed=cfg.seed, progress=progress,
-        )  # fmt: skip
+        dense = whole_clouds.densified(
+            cleaned, count, model=network, device=device, holes=cfg.holes, seed=cfg.seed, progress=progress
+        )
     say(f"dense:  {len(dense)} points with unit normals, {time.perf_counter() - started:.1f} s")
     coarser = int(cfg.quality == "fast")
     depth = reconstruction.octree_depth(dense) - coarser if cfg.depth is None else cfg.depth

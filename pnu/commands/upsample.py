@@ -104,24 +104,22 @@ def upsample(cfg: Any) -> None:
     from pnu.upsamplers.inference import weights_source
     from pnu.upsamplers.selection import CLASSICAL
 
+    checkpoints.resolve(cfg.run)  # says before the work that there is no newest one
     wanted = cfg.ratio if cfg.spacing is None else whole_clouds.ratio_of_spacing(cloud.points, cfg.spacing)
     count, before = whole_clouds.output_count(len(cloud.points), wanted), cloud
     keep = {"true": True, "false": False}.get(str(cfg.keep).lower(), cfg.keep)
-    (cloud, stray, character, *_), own = _sides.cleaned(
-        cfg, cloud, outliers=cfg.outliers, lines="keep" if keep is True else cfg.lines
-    )
+    cleaned, cloud = _sides.cleaned(cfg, cloud, outliers=cfg.outliers, lines="keep" if keep is True else cfg.lines)
     for note in cloud.notes[len(before.notes) :]:
         say(f"        {note}")
     if cfg.removed is not None:
-        io.write_cloud(
-            cfg.removed, before.points[stray], None, {name: v[stray] for name, v in before.attributes.items()}
-        )
+        gone = {name: values[cleaned.stray] for name, values in before.attributes.items()}
+        io.write_cloud(cfg.removed, before.points[cleaned.stray], None, gone)
         say(f"        the points left out: {cfg.removed}")
     look = describe_cloud(cloud.points, cloud.normals)
     say(f"        {look}")
     for text in look.warnings():
         say(f"        {text}")
-    run = weights_source(cfg.run, own, character)
+    run = weights_source(cfg.run, cleaned.cloud.normals, cleaned.character)
     chosen = (
         " (the newest finished one)"
         if cfg.run == NEWEST
@@ -135,16 +133,12 @@ def upsample(cfg: Any) -> None:
     if parts is not None and parts.is_dir():
         say(f"parts:  {parts}, of an earlier start; what fits is taken")
     with stages(cfg.quiet) as progress:
-        dense = whole_clouds.upsample(
-            cloud.points,
-            cloud.normals,
-            ratio=count / len(cloud.points),
+        dense = whole_clouds.densified(
+            cleaned,
+            count,
             merge=cfg.merge,
             density=cfg.density,
             keep=keep,
-            outliers="keep",
-            lines="keep",
-            signs="keep",
             holes=cfg.holes,
             model=checkpoints.load(run, cfg.allow) if cfg.allow and run not in CLASSICAL else run,
             patch_size=cfg.patch_size,

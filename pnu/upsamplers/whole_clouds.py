@@ -189,26 +189,45 @@ def upsample(
     expected = "points: expected an array (n, 3), or (n, 6) with normals"
     given = check_cloud(Cloud(*_taken(points, normals, kind, expected, (3, 6))), "points", minimum=MINIMUM)
     count = output_count(len(given.points), ratio if spacing is None else ratio_of_spacing(given.points, spacing))
-    sizes = (
-        ("patch_size", patch_size, MINIMUM),
-        ("batch_size", batch_size, 1),
-        ("devices", devices, 1),
-        ("seed", seed, 0),
-    )
-    for name, value, least in sizes:
-        if value is not None and not (isinstance(value, Integral) and value >= least):
-            raise ValueError(f"{name}={value}: expected a whole number >= {least}")
-    if holes is not None and not (isinstance(holes, Real) and 0 < holes < float("inf")):
-        raise ValueError(f"holes={_short(holes)}: expected a radius above 0 in the unit of the points")
-    if density not in DENSITIES:
-        raise ValueError(f"density={density}: expected {', '.join(DENSITIES)}")
-    if merge not in get_args(Merge):
-        raise ValueError(f"merge={merge}: expected {' or '.join(get_args(Merge))}")
-    if keep not in (True, False, "auto"):
-        raise ValueError(f"keep={keep}: expected true, false or auto")
+    options: dict[str, Any] = {
+        "patch_size": patch_size, "merge": merge, "density": density, "keep": keep, "holes": holes, "devices": devices,
+        "batch_size": batch_size, "seed": seed,
+    }  # fmt: skip
+    check_options(**options)
     cleaned = clean_cloud(given, outliers=outliers, lines="keep" if keep is True else lines, signs=signs)
+    found = densified(cleaned, count, model=model, device=device, progress=progress, parts=parts, **options)
     given = cleaned.cloud
-    network, target = on_device(*_model(model, given.normals, cleaned.character, device), device)
+    if kind is not None:
+        return kind.dense(points, Cloud(found[:, :3], found[:, 3:], attributes(found, given)))
+    return tensor_like(points, found) if is_tensor(points) else found
+
+
+def densified(
+    cleaned: Cleaned,
+    count: int,
+    *,
+    model: Model = "surface",
+    patch_size: int | None = None,
+    merge: Merge = "farthest",
+    density: Density = "auto",
+    keep: bool | Literal["auto"] = "auto",
+    holes: float | None = None,
+    device: str = "auto",
+    devices: int = 1,
+    batch_size: int | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+    parts: str | PathLike[str] | None = None,
+) -> np.ndarray:
+    """So many points, and those that fill holes, with unit normals, of a cloud that is clean: (count + filled, 6).
+
+    Where the cloud has no normals, `cleaned.estimated` begins with the sides that they say. All else as in `upsample`.
+    """
+    check_options(
+        patch_size=patch_size, merge=merge, density=density, keep=keep, holes=holes, devices=devices,
+        batch_size=batch_size, seed=seed,
+    )  # fmt: skip
+    network, target = on_device(*_model(model, cleaned.cloud.normals, cleaned.character, device), device)
     upsampler = upsampler_of(network, patch_size)
     if devices > 1 and not getattr(upsampler, "parallel", False):
         raise ValueError(f"devices={devices}: {type(network).__name__} works in one process; leave devices=1")
@@ -238,16 +257,38 @@ def upsample(
         dense = with_unit_normals(_upsampled(upsampler, sparse, count, context), sparse)
     found = frame.from_unit(dense)
     if keeps:
-        found = _measured_first(found, dense, sparse, given)
+        found = _measured_first(found, dense, sparse, cleaned.cloud)
     if holes is not None:
         from pnu.reconstruction.hole_filling import fill_holes
 
         progress("holes", 0, 1)
         found = np.vstack([found, fill_holes(found, holes)])
         progress("holes", 1, 1)
-    if kind is not None:
-        return kind.dense(points, Cloud(found[:, :3], found[:, 3:], attributes(found, given)))
-    return tensor_like(points, found) if is_tensor(points) else found
+    return found
+
+
+def check_options(
+    *, patch_size: int | None, merge: str, density: str, keep: bool | str, holes: float | None, devices: int,
+    batch_size: int | None, seed: int,
+) -> None:  # fmt: skip
+    """`ValueError` where an argument of `upsample` by one of these names cannot be."""
+    sizes = (
+        ("patch_size", patch_size, MINIMUM),
+        ("batch_size", batch_size, 1),
+        ("devices", devices, 1),
+        ("seed", seed, 0),
+    )
+    for name, value, least in sizes:
+        if value is not None and not (isinstance(value, Integral) and value >= least):
+            raise ValueError(f"{name}={value}: expected a whole number >= {least}")
+    if holes is not None and not (isinstance(holes, Real) and 0 < holes < float("inf")):
+        raise ValueError(f"holes={_short(holes)}: expected a radius above 0 in the unit of the points")
+    if density not in DENSITIES:
+        raise ValueError(f"density={density}: expected {', '.join(DENSITIES)}")
+    if merge not in get_args(Merge):
+        raise ValueError(f"merge={merge}: expected {' or '.join(get_args(Merge))}")
+    if keep not in (True, False, "auto"):
+        raise ValueError(f"keep={keep}: expected true, false or auto")
 
 
 def _upsampled(upsampler: Upsampler, sparse: np.ndarray, count: int, context: Context) -> np.ndarray:
@@ -506,10 +547,8 @@ def _prepare(cleaned: Cleaned, progress: Progress, *, refine: bool = False) -> t
     if missing.any():
         progress("normals", 0, 1)
         if given is None:
-            estimated = cleaned.estimated
-            if estimated is None:
-                estimated = settled_normals(cloud.points, None, found=cleaned.sight).normals
-            directions = estimated[order]
+            estimated = cleaned.estimated or settled_normals(cloud.points, None, found=cleaned.sight)
+            directions = estimated.normals[order]
         else:
             directions = complete_normals(unit, given)
         if refine:

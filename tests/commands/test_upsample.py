@@ -12,6 +12,8 @@ import torch
 import yaml
 
 from pnu.commands.upsample import main
+from pnu.data import shapes
+from pnu.geometry.mesh_sampling import sample_poisson_disk
 from pnu.io import read_cloud, write_cloud, write_json
 from pnu.networks.pnu import PNU
 from tests.refusals import ran
@@ -245,6 +247,21 @@ def test_what_was_left_out_while_reading_is_said(place: Path) -> None:
     assert "1620 of 1800 points left out: at the place of another" in done.stdout
     assert "5 of 180 normals are zero or NaN: theirs are estimated" in done.stdout
     assert len(read_cloud(place / "dense.ply").points) == 360
+
+
+@pytest.mark.parametrize("run", ["surface", "pnu_residual"])
+def test_who_tells_the_side_gets_normals_as_good_as_who_does_not(place: Path, run: str) -> None:
+    points = sample_poisson_disk(shapes.make("teddy"), 600, np.random.default_rng(0))[:, :3]
+    write_cloud(place / "bare.ply", points)
+    found = []
+    for told in ("side=null", "side=out", "viewpoint=0,0,9"):
+        done = upsample(place, "input=bare.ply", "output=dense.ply", f"run={run}", "ratio=2", told)
+        assert done.returncode == 0, done.stderr
+        assert "normals: 600 estimated; side: " in done.stdout
+        found.append(read_cloud(place / "dense.ply"))
+    for cloud in found[1:]:
+        np.testing.assert_array_equal(cloud.points, found[0].points)
+        np.testing.assert_array_equal(cloud.normals, found[0].normals)
 
 
 @pytest.mark.slow

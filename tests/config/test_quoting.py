@@ -341,7 +341,7 @@ def test_interrupted_before_anything_is_made(
         raise KeyboardInterrupt
 
     line = shell_line("upsample", input="cloud.ply", output=in_nasty("dense.ply"), run="surface")
-    monkeypatch.setattr("pnu.upsamplers.whole_clouds.upsample", stop)
+    monkeypatch.setattr("pnu.upsamplers.whole_clouds.densified", stop)
     with pytest.raises(SystemExit) as stopped:
         say(line)
     assert stopped.value.code == 130
