@@ -80,7 +80,7 @@ def job_folder(config: Mapping[str, Any]) -> RunFolder:
     hydra = HydraConfig.get()
     # not of the job's own idea of where it runs: a launcher's processes may have been started elsewhere
     sweep, digest = Path(hydra.runtime.cwd, hydra.sweep.dir, hydra.sweep.subdir), config_hash(config)
-    label = label_of(str(hydra.job.override_dirname)) or str(config["name"])
+    label = label_of(str(hydra.job.override_dirname), str(hydra.runtime.choices.get("setting") or "")) or config["name"]
     found = [run for run in runs(sweep) if read_json(run.record_path).get("config_hash") == digest]
     folder = found[0] if found else RunFolder(sweep / f"{label}_{digest[:8]}")
     folder.path.mkdir(parents=True, exist_ok=True)
@@ -115,11 +115,12 @@ def weights_before(run: RunFolder) -> Path:
     return before[0].path
 
 
-def label_of(overrides: str) -> str:
+def label_of(overrides: str, setting: str = "") -> str:
     """A short name of what sets a job apart: "seed=0,setting=loss_terms/no_cd" becomes "no_cd_seed-0"; no sign in it
-    wants quotes."""
+    wants quotes. setting: the one that all jobs of a command have, which is not among what is swept."""
     parts = []
-    for part in filter(None, overrides.split(",")):
+    given = filter(None, overrides.split(","))
+    for part in (f"setting={setting}", *given) if setting and "setting=" not in overrides else given:
         key, _, value = part.lstrip("+").partition("=")
         try:
             value = f"{float(value):.4g}"

@@ -150,6 +150,8 @@ def test_the_same_command_is_the_same_sweep() -> None:
 def test_labels_are_short() -> None:
     assert label_of("seed=0,setting=loss_terms/no_cd") == "no_cd_seed-0"
     assert label_of("loss.w2=0.15676677195506075") == "loss.w2-0.1568"
+    assert label_of("seed=0,setting=loss_terms/no_cd", "loss_terms/no_cd") == "no_cd_seed-0"
+    assert label_of("seed=0", "loss_terms/no_cd") == "no_cd_seed-0"  # of a command with this setting alone
     assert label_of("data.path=/a/b c.h5,optimizer.lr=1e30") == "data.path-b-c.h5_optimizer.lr-1e+30"
 
 
