@@ -78,8 +78,8 @@ def settled_normals(
         lines = np.where(known[:, None], lines, refine(unit, lines, progress))
     sight = asked or found or sight_by_places(points)
     if sight is None and (anew[known].any() or not known.any()):
-        place = scanner_within(unit, lines)
-        sight = None if place is None else scanner_sight(frame.from_unit(place[None])[0])
+        place = scanner_within(points[order], lines)
+        sight = None if place is None else scanner_sight(place)
     if sight is not None and sight.viewpoint is not None:
         of_each = sight.viewpoint.ndim == 2
         places = sight.viewpoint[order] if of_each else sight.viewpoint

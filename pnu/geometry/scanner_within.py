@@ -26,7 +26,10 @@ UNEVEN = 0.3  # mean deviation of the density's logarithm below which it tells n
 GRID, DENSEST, AWAY = 6, 40, (0.03, 0.1, 0.3)  # places that are tried: along each axis; radii before the densest points
 TRIED, STARTS, STEPS = 16, 3, 80  # of those, looked at with what is hidden from them, then moved, so often
 STEP = 0.1  # radii by which the search begins to move a place
-LIKELY, EXPLAINED = 0.25, 0.35  # of the deviation that a place explains, for a start and for a scanner
+LIKELY, EXPLAINED = 0.25, 0.42  # of the deviation that a place explains, for a start and for a scanner
+CENTRAL = 0.08  # radii from the middle, within which things lie whose points were made along rays from there
+AS_WELL = 0.05  # by so much less its mirror image may explain, which then may be the scanner too
+LYING = 0.9  # cosine between a point's line and the one that most have, from which on it lies on a ground
 LEAST = 0.05  # cosine of a slant, below which a scanner sees nothing
 
 
@@ -34,8 +37,8 @@ def scanner_within(points: Floats, lines: Floats) -> Floats | None:
     """The place (3,) amid points (n, 3) with unit lines (n, 3) from which they were scanned; None: there is none.
 
     Sought (Nelder and Mead 1965) where the density that a scanner there would leave is the most like that of the
-    cloud. About a hundredth of the extent it may be off in a room, more from the air of an open place; of several
-    scanners it is one, or a place between them.
+    cloud, and at the origin first. About a hundredth of the extent it may be off in a room, more in the open; of
+    several scanners it is one, or a place between them.
     """
     if len(points) < FEWEST:
         return None
@@ -48,10 +51,23 @@ def scanner_within(points: Floats, lines: Floats) -> Floats | None:
     view = _View((points[looked] - middle) / radius, lines[looked], -2 * np.log(np.maximum(far, 1e-9 * radius)))
     if view.deviation < UNEVEN:
         return None
+    origin = -middle / radius
+    best, most = origin, view.explained_with_hidden(origin) if view.holds(origin) else 0.0
+    if most < EXPLAINED:
+        best, most = _likeliest(view)
+    if most < EXPLAINED or not view.holds(best) or np.linalg.norm(best) < CENTRAL:
+        return None
+    if best is not origin and view.explained_with_hidden(view.mirrored(best)) > most - AS_WELL:
+        return None  # ground alone, seen from above or from below
+    return np.asarray(middle + radius * best)
+
+
+def _likeliest(view: _View) -> tuple[Floats, float]:
+    """The place (3,) that explains the most, and how much."""
     places = view.places()
     plain = view.explained(view.densities(places))
     if plain.max() < LIKELY:
-        return None
+        return places[0], 0.0
     some = places[np.argsort(-plain, kind="stable")[:TRIED]]
     first = np.array([view.explained_with_hidden(place) for place in some])
     from scipy.optimize import minimize  # takes a moment to load
@@ -63,7 +79,7 @@ def scanner_within(points: Floats, lines: Floats) -> Floats | None:
         found = minimize(lambda place: -view.explained_with_hidden(place), start, method="Nelder-Mead", options=options)
         if -found.fun > most:
             best, most = found.x, -float(found.fun)
-    return middle + radius * best if most > EXPLAINED and view.holds(best) else None
+    return best, most
 
 
 class _View:
@@ -90,6 +106,13 @@ class _View:
         low, high = self.box()
         return bool((place > low - 0.5 * (high - low).max()).all() and (place < high + 0.5 * (high - low).max()).all())
 
+    def mirrored(self, place: Floats) -> Floats:
+        """The place (3,) on the other side of the plane on which most points lie, if there is such a one."""
+        axis = np.linalg.eigh(self.lines.T @ self.lines)[1][:, -1]
+        across = np.abs(self.lines @ axis) > LYING
+        level = np.median((self.points @ axis)[across]) if across.any() else 0.0
+        return np.asarray(place - 2 * (place @ axis - level) * axis)
+
     def densities(self, places: Floats) -> Floats:
         """That scanners at places (m, 3) would leave if nothing stood before anything, to a factor: (m, n)."""
         way = places[:, None] - self.points
@@ -101,10 +124,10 @@ class _View:
         """Share of the deviation that densities (m, n) explain, less by the share of what gets none: (m,)."""
         there = densities > 0
         rest = np.where(there, self.density - np.log(np.where(there, densities, 1)), np.nan)
-        left = np.full(len(rest), np.inf)
-        some = there.any(1)
-        left[some] = np.nanmean(np.abs(rest[some] - np.nanmedian(rest[some], axis=1, keepdims=True)), axis=1)
-        return np.asarray(there.mean(1) * (1 - left / self.deviation))
+        share, some = np.full(len(rest), -np.inf), there.any(1)
+        left = np.abs(rest[some] - np.nanmedian(rest[some], axis=1, keepdims=True))
+        share[some] = there[some].mean(1) * (1 - np.nanmean(left, axis=1) / self.deviation)
+        return share
 
     def explained_with_hidden(self, place: Floats) -> float:
         """The same of one place (3,), from which some points hide others."""

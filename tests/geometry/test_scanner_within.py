@@ -12,6 +12,7 @@ from pnu.data.scanner import KINDS, Scanner
 from pnu.geometry.cloud_normals import GROUND, settled_normals
 from pnu.geometry.normal_estimation import complete_normals
 from pnu.geometry.scanner_within import scanner_within
+from pnu.geometry.sphere_directions import sphere_directions
 
 Array = NDArray[np.float64]
 SIZE = np.array([6.0, 4.0, 3.0])  # of the scanned room
@@ -66,6 +67,21 @@ def test_none_is_found_in_what_was_scanned_from_outside(name: str, kind: str) ->
     place = scanner_within(points, complete_normals(points, None, 16))
     if kind != "oneview":  # whose camera is outside of the points
         assert place is None
+
+
+def test_a_star_made_along_rays_from_its_middle_looks_outward() -> None:
+    ways = sphere_directions(5000)
+    points = (1 + 0.6 * ways[:, :1] * ways[:, 1:2] * ways[:, 2:] * 3**1.5) * ways
+    assert scanner_within(points, complete_normals(points, None, 16)) is None
+    assert ((pnu.normals(points) * points).sum(1) > 0).mean() > 0.99
+
+
+def test_of_flat_ground_alone_the_scanner_may_be_above_or_below() -> None:
+    ways = sphere_directions(8000)
+    ways = ways[(ways[:, 2] < -0.1) & (ways[:, 2] > -0.9)]
+    ground = -1.7 * ways / ways[:, 2:]
+    assert scanner_within(ground + [3.0, 0, 0], np.tile([0.0, 0, 1], (len(ground), 1))) is None
+    assert (pnu.normals(ground + [3.0, 0, 0])[:, 2] > 0).all()
 
 
 def test_few_points_and_equal_ones_tell_nothing() -> None:
