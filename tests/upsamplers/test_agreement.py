@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 import pnu
 from pnu.geometry.farthest_sampling import farthest_points_large
-from pnu.upsamplers.agreement import agreeing_spheres, most_agreed
+from pnu.upsamplers.agreement import agreeing_spheres, most_agreed, off_spheres
 from pnu.upsamplers.context import Context
 
 
@@ -112,6 +112,23 @@ def test_a_point_of_the_cloud_without_any_near_gets_one() -> None:
     found = most_agreed(predicted, cloud, cloud[:0], 2400, Context(), "agreement")
     assert bare(found) < 0.5 * spacing
     assert np.abs(np.linalg.norm(found[:, :3], axis=1) - 1).max() < 1e-3
+
+
+def test_what_lies_off_the_cloud_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Predictions agree on a bump beside the sphere that the cloud knows nothing of."""
+    cloud, predicted = ball(1000, 0), ball(20000, 0.002)
+    bump = np.arccos(predicted[:, 2].clip(-1, 1)) < 0.06
+    predicted[bump, :3] *= 1.08
+    off = off_spheres(np.array([[0, 0, 1.08, 0, 0, 1.0], [0, 0, -1.0, 0, 0, -1.0]]), cloud, Context())
+    spacing = np.sort(np.linalg.norm(cloud[:, None, :3] - cloud[None, :, :3], axis=2), 1)[:, 1:7].mean()
+    assert off[0] == pytest.approx(0.08 / spacing, rel=0.2)
+    assert off[1] < 1e-3
+    found = most_agreed(predicted, cloud, cloud[:0], 4000, Context(), "agreement")
+    assert found.shape == (4000, 6)
+    monkeypatch.setattr("pnu.upsamplers.agreement.REJECTED", 0.0)
+    with_all = most_agreed(predicted, cloud, cloud[:0], 4000, Context(), "agreement")
+    left, before = ((np.linalg.norm(each[:, :3], axis=1) > 1.04).sum() for each in (found, with_all))
+    assert left < 0.5 * before
 
 
 class Shifted(nn.Module):
