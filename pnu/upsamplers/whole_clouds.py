@@ -193,7 +193,7 @@ def upsample(
         "patch_size": patch_size, "merge": merge, "density": density, "keep": keep, "holes": holes, "devices": devices,
         "batch_size": batch_size, "seed": seed,
     }  # fmt: skip
-    check_arguments(**options)
+    check_choices(**options)
     cleaned = clean_cloud(given, outliers=outliers, lines="keep" if keep is True else lines, signs=signs)
     found = densified(cleaned, count, model=model, device=device, progress=progress, parts=parts, **options)
     given = cleaned.cloud
@@ -223,7 +223,7 @@ def densified(
 
     Where the cloud has no normals, `cleaned.estimated` begins with the sides that they say. All else as in `upsample`.
     """
-    check_arguments(
+    check_choices(
         patch_size=patch_size, merge=merge, density=density, keep=keep, holes=holes, devices=devices,
         batch_size=batch_size, seed=seed,
     )  # fmt: skip
@@ -267,7 +267,7 @@ def densified(
     return found
 
 
-def check_arguments(
+def check_choices(
     *, patch_size: int | None, merge: str, density: str, keep: bool | str, holes: float | None, devices: int,
     batch_size: int | None, seed: int,
 ) -> None:  # fmt: skip
