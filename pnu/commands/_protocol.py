@@ -14,8 +14,8 @@ KINDS = (
 )
 
 MERGE = (
-    "of networks of patches: farthest: the farthest points of all predictions, as in the paper; agreed: where the "
-    "predictions of overlapping patches, each in two orientations, agree"
+    "of networks of patches: farthest: the farthest points of all predictions, as in the paper; agreed: on "
+    "the spheres that the predictions of overlapping patches fit"
 )
 KEEP = (
     "of surface and networks of patches: true: the points given are in the result, unmoved; false: all are new; "

@@ -79,7 +79,7 @@ def settled_normals(
     sight = asked or found or sight_by_places(points)
     if sight is None and (anew[known].any() or not known.any()):
         place = scanner_within(points[order], lines)
-        sight = None if place is None else scanner_sight(place)
+        sight = None if place is None else scanner_sight(place, frame.scale.item())
     if sight is not None and sight.viewpoint is not None:
         of_each = sight.viewpoint.ndim == 2
         places = sight.viewpoint[order] if of_each else sight.viewpoint
@@ -125,9 +125,10 @@ def camera_sight(place: np.ndarray) -> Sight:
     return Sight(f"towards a {camera_words(place)}, whose pixels they are", viewpoint=place, pixels=True)
 
 
-def scanner_sight(place: np.ndarray) -> Sight:
-    """That of a scanner amid the points whose place (3,) was found."""
-    where = ",".join(f"{value:.3g}" for value in place)
+def scanner_sight(place: np.ndarray, radius: float) -> Sight:
+    """That of a scanner whose place (3,) amid points within such a radius was found."""
+    digits = max(0, 2 - int(np.floor(np.log10(radius))))  # a hundredth of it
+    where = ",".join(f"{value:.{digits}f}" for value in place)
     return Sight(f"towards a scanner within, at about {where}, from which they thin out", viewpoint=place)
 
 

@@ -144,8 +144,7 @@ def upsample(
             "surface" takes the weights made for estimated normals where none are given.
         patch_size: points of a patch, at least 16; None: what the network was made for. "surface" has no patches.
         merge: of networks of patches. "farthest": the farthest points of all predictions, as in the paper; "agreed":
-            each patch is seen in two orientations, and points lie where the predictions around them agree, in twice
-            the time.
+            points lie on the spheres that the predictions around them fit, in half as much time again.
         density: of the points of "surface". "even" over the surface; "follow": each point becomes `ratio`; "auto": even
             where no place loses points by it, elsewhere those that it has.
         keep: of "surface" and networks of patches. True: the points given are among those that come out, first and
