@@ -24,10 +24,12 @@ from pnu.cleaning import Character, is_noisy, stray_points
 from pnu.cleaning.outliers import MANY
 from pnu.geometry.anisotropy import thinned_lines
 from pnu.geometry.cells import Cells
-from pnu.geometry.cloud_normals import contradiction, is_height_map, settled_normals
+from pnu.geometry.cloud_normals import contradiction, is_height_map, scanner_sight, settled_normals
 from pnu.geometry.cloud_statistics import FAINT
 from pnu.geometry.farthest_sampling import farthest_points_large
+from pnu.geometry.normal_estimation import complete_normals
 from pnu.geometry.point_tree import PointTree
+from pnu.geometry.scanner_within import scanner_within
 from pnu.geometry.spacing import local_spacing
 from pnu.io import atomic_path, read_json, write_json
 from pnu.io.cloud import ORIGIN, UNSEEN, Cloud, first_of_each_place, looks_geographic, unit_normals
@@ -422,13 +424,16 @@ def _coarse_cloud(folder: Path, keys: Keys, facts: Facts, full: list[int]) -> No
     step = max(1, facts.points // (4 * COARSE))
     parts = [np.load(folder / f"points_{number:05}.npy", mmap_mode="r")[::step] for number in full]
     rows = np.concatenate([np.asarray(part) for part in parts])
+    asked, found = asked_sight(keys.viewpoint, keys.up, keys.side), None
     if len(rows) > COARSE:
+        if asked is None and not facts.given:  # whoever scanned it shows in what is not even yet
+            place = scanner_within(rows["point"], complete_normals(rows["point"], None))
+            found = None if place is None else scanner_sight(place, float(np.ptp(rows["point"], axis=0).max()))
         rows = rows[farthest_points_large(rows["point"], COARSE)]
-    asked = asked_sight(keys.viewpoint, keys.up, keys.side)
     settled = settled_normals(
         rows["point"], rows["normal"] if facts.given else None,
         choice=keys.normals if keys.normals != "auto" or not facts.turned else "orient",  # type: ignore[arg-type]
-        asked=asked, found=sight_of(keys.input, attributes_of(rows)),
+        asked=asked, found=sight_of(keys.input, attributes_of(rows)) or found,
     )  # fmt: skip
     with atomic_path(folder / "coarse.npy") as temporary:
         np.save(temporary, np.hstack([rows["point"], settled.normals]))

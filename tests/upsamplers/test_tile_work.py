@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from bench.scenes import scanned_room
 from pnu.io import read_cloud, write_cloud
 from pnu.upsamplers import tile_seams, tile_work
 from pnu.upsamplers.tile_plan import Keys, Plan, planned
@@ -106,6 +107,17 @@ def test_sides_agree_between_tiles(tmp_path: Path) -> None:
     for up, sign in (("z", 1), ("-z", -1)):
         dense = make(plan_of(tmp_path / up, sheet(200), 110, ratio=1.5, up=up))
         assert (sign * dense[:, 5] > 0).all()
+
+
+def test_a_coarse_cloud_looks_to_the_scanner_that_the_whole_tells(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pnu.upsamplers.tile_plan.COARSE", 1350)
+    points, normals = scanned_room(np.array([2, 2.4, 1.5]))
+    coarse = np.load(plan_of(tmp_path, points, 2000).folder / "coarse.npy")
+    assert len(coarse) == 1350
+    near = cKDTree(points).query(coarse[:, :3])[1]
+    assert ((coarse[:, 3:] * normals[near]).sum(1) > 0).mean() > 0.98
 
 
 def test_given_normals_and_points_stay(tmp_path: Path) -> None:
