@@ -101,10 +101,16 @@ def upsample(cfg: Any) -> None:
     from pnu.networks import checkpoints
     from pnu.networks.checkpoints import NEWEST
     from pnu.upsamplers import whole_clouds
-    from pnu.upsamplers.inference import weights_source
+    from pnu.upsamplers.inference import LoadedWeights, weights_source
     from pnu.upsamplers.selection import CLASSICAL
 
-    checkpoints.resolve(cfg.run)  # says before the work that there is no newest one
+    # what is no network is refused before the work; which of four "surface" is, shows later
+    if cfg.allow and cfg.run != "surface" and cfg.run not in CLASSICAL:
+        model: Any = checkpoints.load(cfg.run, cfg.allow)
+    else:
+        model = LoadedWeights(cfg.run)
+        if cfg.run != "surface":
+            model.network(device=cfg.device)
     wanted = cfg.ratio if cfg.spacing is None else whole_clouds.ratio_of_spacing(cloud.points, cfg.spacing)
     count, before = whole_clouds.output_count(len(cloud.points), wanted), cloud
     keep = {"true": True, "false": False}.get(str(cfg.keep).lower(), cfg.keep)
@@ -140,7 +146,7 @@ def upsample(cfg: Any) -> None:
             density=cfg.density,
             keep=keep,
             holes=cfg.holes,
-            model=checkpoints.load(run, cfg.allow) if cfg.allow and run not in CLASSICAL else run,
+            model=model,
             patch_size=cfg.patch_size,
             device=cfg.device,
             devices=cfg.devices,
