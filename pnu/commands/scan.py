@@ -80,10 +80,9 @@ def scan(cfg: Any) -> None:
     for name, value in QUALITIES[cfg.quality].items():
         setattr(network, name, value)
     device = "cpu" if is_cpu("auto") else "cuda"
+    options = whole_clouds.Densification(holes=cfg.holes, seed=cfg.seed)
     with stages(cfg.quiet) as progress:
-        dense = whole_clouds.densified(
-            cleaned, count, model=network, device=device, holes=cfg.holes, seed=cfg.seed, progress=progress
-        )
+        dense = whole_clouds.densified(cleaned, count, options, model=network, device=device, progress=progress)
     say(f"dense:  {len(dense)} points with unit normals, {time.perf_counter() - started:.1f} s")
     coarser = int(cfg.quality == "fast")
     depth = reconstruction.octree_depth(dense) - coarser if cfg.depth is None else cfg.depth

@@ -138,22 +138,12 @@ def upsample(cfg: Any) -> None:
     parts = Path(f"{cfg.output}.parts") if count >= LONG else None
     if parts is not None and parts.is_dir():
         say(f"parts:  {parts}, of an earlier start; what fits is taken")
+    options = whole_clouds.Densification(
+        cfg.patch_size, cfg.merge, cfg.density, keep, cfg.holes, cfg.devices, cfg.batch_size, cfg.seed
+    )
     with stages(cfg.quiet) as progress:
         dense = whole_clouds.densified(
-            cleaned,
-            count,
-            merge=cfg.merge,
-            density=cfg.density,
-            keep=keep,
-            holes=cfg.holes,
-            model=model,
-            patch_size=cfg.patch_size,
-            device=cfg.device,
-            devices=cfg.devices,
-            batch_size=cfg.batch_size,
-            seed=cfg.seed,
-            progress=progress,
-            parts=parts,
+            cleaned, count, options, model=model, device=cfg.device, progress=progress, parts=parts
         )
     kept = io.kept_attributes(cfg.output, cloud.attributes)
     held = cloud._replace(attributes={name: cloud.attributes[name] for name in kept})

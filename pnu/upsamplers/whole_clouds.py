@@ -6,7 +6,7 @@ import copy
 import hashlib
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
@@ -188,33 +188,50 @@ def upsample(
     expected = "points: expected an array (n, 3), or (n, 6) with normals"
     given = check_cloud(Cloud(*_taken(points, normals, kind, expected, (3, 6))), "points", minimum=MINIMUM)
     count = output_count(len(given.points), ratio if spacing is None else ratio_of_spacing(given.points, spacing))
-    options: dict[str, Any] = {
-        "patch_size": patch_size, "merge": merge, "density": density, "keep": keep, "holes": holes, "devices": devices,
-        "batch_size": batch_size, "seed": seed,
-    }  # fmt: skip
-    check_choices(**options)
+    options = Densification(patch_size, merge, density, keep, holes, devices, batch_size, seed)
     cleaned = clean_cloud(given, outliers=outliers, lines="keep" if keep is True else lines, signs=signs)
-    found = densified(cleaned, count, model=model, device=device, progress=progress, parts=parts, **options)
+    found = densified(cleaned, count, options, model=model, device=device, progress=progress, parts=parts)
     given = cleaned.cloud
     if kind is not None:
         return kind.dense(points, Cloud(found[:, :3], found[:, 3:], attributes(found, given)))
     return tensor_like(points, found) if is_tensor(points) else found
 
 
+@dataclass(frozen=True)
+class Densification:
+    """Arguments of `upsample` by these names; `ValueError` where one cannot be."""
+
+    patch_size: int | None = None
+    merge: Merge = "farthest"
+    density: Density = "auto"
+    keep: bool | Literal["auto"] = "auto"
+    holes: float | None = None
+    devices: int = 1
+    batch_size: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, least in (("patch_size", MINIMUM), ("batch_size", 1), ("devices", 1), ("seed", 0)):
+            value: Any = getattr(self, name)
+            if value is not None and (not isinstance(value, Integral) or int(value) < least):
+                raise ValueError(f"{name}={value}: expected a whole number >= {least}")
+        if self.holes is not None and not (isinstance(self.holes, Real) and 0 < self.holes < float("inf")):
+            raise ValueError(f"holes={_short(self.holes)}: expected a radius above 0 in the unit of the points")
+        if self.density not in DENSITIES:
+            raise ValueError(f"density={self.density}: expected {', '.join(DENSITIES)}")
+        if self.merge not in get_args(Merge):
+            raise ValueError(f"merge={self.merge}: expected {' or '.join(get_args(Merge))}")
+        if self.keep not in (True, False, "auto"):
+            raise ValueError(f"keep={self.keep}: expected true, false or auto")
+
+
 def densified(
     cleaned: Cleaned,
     count: int,
+    options: Densification,
     *,
     model: Model = "surface",
-    patch_size: int | None = None,
-    merge: Merge = "farthest",
-    density: Density = "auto",
-    keep: bool | Literal["auto"] = "auto",
-    holes: float | None = None,
     device: str = "auto",
-    devices: int = 1,
-    batch_size: int | None = None,
-    seed: int = 0,
     progress: Progress = silent,
     parts: str | PathLike[str] | None = None,
 ) -> np.ndarray:
@@ -222,12 +239,9 @@ def densified(
 
     Where the cloud has no normals, `cleaned.estimated` begins with the sides that they say. All else as in `upsample`.
     """
-    check_choices(
-        patch_size=patch_size, merge=merge, density=density, keep=keep, holes=holes, devices=devices,
-        batch_size=batch_size, seed=seed,
-    )  # fmt: skip
+    merge, density, keep, devices = options.merge, options.density, options.keep, options.devices
     network, target = on_device(*_model(model, cleaned.cloud.normals, cleaned.character, device), device)
-    upsampler = upsampler_of(network, patch_size)
+    upsampler = upsampler_of(network, options.patch_size)
     if devices > 1 and not getattr(upsampler, "parallel", False):
         raise ValueError(f"devices={devices}: {type(network).__name__} works in one process; leave devices=1")
     if merge == "agreed" and not getattr(upsampler, "merges", False):
@@ -246,7 +260,7 @@ def densified(
     digest = _digest(network, sparse, count, upsampler, density, keeps, even, merge)
     finished = Parts() if parts is None else Parts(Path(parts) / digest)
     context = Context(
-        target, batch_size, int(seed), progress, finished,
+        target, options.batch_size, int(options.seed), progress, finished,
         density=density, keep=keeps, smooth=even and not clean, merge=merge,
     )  # fmt: skip
     with inferring(network), ExitStack() as stack:
@@ -257,37 +271,13 @@ def densified(
     found = frame.from_unit(dense)
     if keeps:
         found = _measured_first(found, dense, sparse, cleaned.cloud)
-    if holes is not None:
+    if options.holes is not None:
         from pnu.reconstruction.hole_filling import fill_holes
 
         progress("holes", 0, 1)
-        found = np.vstack([found, fill_holes(found, holes)])
+        found = np.vstack([found, fill_holes(found, options.holes)])
         progress("holes", 1, 1)
     return found
-
-
-def check_choices(
-    *, patch_size: int | None, merge: str, density: str, keep: bool | str, holes: float | None, devices: int,
-    batch_size: int | None, seed: int,
-) -> None:  # fmt: skip
-    """`ValueError` where an argument of `upsample` by one of these names cannot be."""
-    sizes = (
-        ("patch_size", patch_size, MINIMUM),
-        ("batch_size", batch_size, 1),
-        ("devices", devices, 1),
-        ("seed", seed, 0),
-    )
-    for name, value, least in sizes:
-        if value is not None and not (isinstance(value, Integral) and value >= least):
-            raise ValueError(f"{name}={value}: expected a whole number >= {least}")
-    if holes is not None and not (isinstance(holes, Real) and 0 < holes < float("inf")):
-        raise ValueError(f"holes={_short(holes)}: expected a radius above 0 in the unit of the points")
-    if density not in DENSITIES:
-        raise ValueError(f"density={density}: expected {', '.join(DENSITIES)}")
-    if merge not in get_args(Merge):
-        raise ValueError(f"merge={merge}: expected {' or '.join(get_args(Merge))}")
-    if keep not in (True, False, "auto"):
-        raise ValueError(f"keep={keep}: expected true, false or auto")
 
 
 def _upsampled(upsampler: Upsampler, sparse: np.ndarray, count: int, context: Context) -> np.ndarray:
