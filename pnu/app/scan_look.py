@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pnu.cleaning import Cleaned
 from pnu.geometry.cloud_statistics import CloudStatistics, describe_cloud
+from pnu.geometry.kd_tree import kd_tree
 from pnu.geometry.open_rims import OpenRim, open_rims
 from pnu.io import Cloud
 from pnu.io.atomic import atomic_path
@@ -107,8 +107,8 @@ def show_result(path: str, before: Cloud, cleaned: Cleaned, dense: str, mesh: st
     rows = shown_rows(len(before.points), cleaned.stray)
     cloud = read_shape(dense)
     some = shown_rows(len(cloud.points))
-    tree = cKDTree(before.points[kept])
-    errors = [cKDTree(cloud.points).query(before.points[rows])[0], tree.query(cloud.points[some])[0]]
+    tree = kd_tree(before.points[kept])
+    errors = [kd_tree(cloud.points).query(before.points[rows])[0], tree.query(cloud.points[some])[0]]
     drawings = [
         scan_drawing(before, found, rows)._replace(cloud_error=errors[0]),
         cloud_drawing(cloud, some, errors[1]),

@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from pnu import reconstruction
 from pnu.benchmark.pair_folders import PairFolders, Warn, named_count, pair_files, pair_folders
 from pnu.data import scanner
+from pnu.geometry.kd_tree import kd_tree
 from pnu.geometry.mesh_sampling import face_areas, sample_area, sample_poisson_disk
 from pnu.geometry.mesh_topology import open_edges
 from pnu.geometry.sampling import nonuniform_points
@@ -88,7 +88,7 @@ def mesh_cases(
 def seen_samples(samples: np.ndarray, scan: scanner.SimulatedScan, kind: str) -> np.ndarray:
     """Those of the samples (m, 3 or 6) of a true surface that lie where a scan of one of `SCANS` has points."""
     there = scan.clean[np.isfinite(scan.clean[:, 0]), :3]
-    tree = cKDTree(there)
+    tree = kd_tree(there)
     reach = LINE if kind == "lines" else SEEN * float(np.median(tree.query(there, 4)[0][:, 3]))
     found: np.ndarray = samples[tree.query(samples[:, :3])[0] < reach]
     return found

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import nn
 
 from pnu.benchmark.cases import generator
 from pnu.benchmark.measuring import Row
 from pnu.data.normal_patches import NORMAL_KINDS, draw_cloud
 from pnu.geometry.jet_normals import jet_normals
+from pnu.geometry.kd_tree import kd_tree
 from pnu.geometry.normal_estimation import estimate_normals, orient_normals
 from pnu.io import Mesh
 from pnu.metrics.normal_scores import normal_scores
@@ -60,7 +60,7 @@ def network_estimator(network: nn.Module, name: str, at_once: int = 512) -> Esti
     def estimate(points: np.ndarray) -> np.ndarray:
         if len(points) < k:
             raise ValueError(f"points={len(points)}: {name} sees {k} neighbors, give as many points")
-        near = cKDTree(points).query(points, k=k)[1]
+        near = kd_tree(points).query(points, k=k)[1]
         with torch.no_grad():
             rows = [
                 found(torch.from_numpy(points[idx] - points[idx[:, :1]]).float()[None])[0, :, 3:].double()

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch.utils.data import Dataset
 
 from pnu.data import shapes
 from pnu.data.patch_module import EpochDataModule
+from pnu.geometry.kd_tree import kd_tree
 from pnu.geometry.mesh_sampling import sample_area
 from pnu.io import Mesh, meshes_of, read_mesh
 
@@ -62,7 +62,7 @@ class NormalPatches(Dataset[dict[str, Any]]):
         turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         cloud = np.hstack([cloud[:, :3] @ turn, cloud[:, 3:] @ turn])
         chosen = rng.choice(self.points, self.queries, replace=False)
-        near = cKDTree(cloud[:, :3]).query(cloud[chosen, :3], k=self.neighbors)[1]
+        near = kd_tree(cloud[:, :3]).query(cloud[chosen, :3], k=self.neighbors)[1]
         return {
             "input": torch.from_numpy(cloud[near, :3]).float(),
             "target": torch.from_numpy(cloud[chosen]).float(),

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from pnu.data.shapes import unit_mesh
 from pnu.extras import needed
 from pnu.geometry.farthest_sampling import farthest_points_large
+from pnu.geometry.kd_tree import kd_tree
 from pnu.geometry.mesh_sampling import sample_area
 from pnu.geometry.mesh_topology import open_edges
 from pnu.geometry.sharp_edges import sharp_edge_points
@@ -55,7 +55,7 @@ def cut_patches(mesh: Mesh, count: int, rng: np.random.Generator) -> ShapePatche
     for share, part in zip(SHARES, (count - count // 2, count // 2), strict=True):
         dense = even[: round(PATCH_POINTS / share)]
         centers = dense[farthest_points_large(dense[:, :3], part), :3] if part else dense[:0, :3]
-        clouds.append(dense[cKDTree(dense[:, :3]).query(centers, PATCH_POINTS)[1]])
+        clouds.append(dense[kd_tree(dense[:, :3]).query(centers, PATCH_POINTS)[1]])
     patches = np.concatenate(clouds)
     edges = np.stack([edges_of(patch, sharp, rng) for patch in patches])
     return ShapePatches(patches, edges, open_edges(mesh))
@@ -65,7 +65,7 @@ def edges_of(patch: np.ndarray, sharp: np.ndarray, rng: np.random.Generator) -> 
     """(256, 3): those of the points on sharp edges that a patch reaches, rows of NaN where there are fewer."""
     chosen = np.full((EDGE_POINTS, 3), np.nan, np.float32)
     if len(sharp):
-        tree = cKDTree(patch[:, :3])
+        tree = kd_tree(patch[:, :3])
         spacing = np.median(tree.query(patch[::16, :3], 2)[0][:, 1])
         near = sharp[tree.query(sharp, distance_upper_bound=2 * spacing)[0] < np.inf]
         kept = near if len(near) <= EDGE_POINTS else near[rng.permutation(len(near))[:EDGE_POINTS]]
@@ -373,7 +373,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         clouds = file["poisson_4096"]
         sample = clouds[:: -(-len(clouds) // 32)].astype(float)
         points, normals = sample[..., :3], sample[..., 3:]
-        spacing = [np.median(cKDTree(cloud).query(cloud, 2)[0][:, 1]) for cloud in points]
+        spacing = [np.median(kd_tree(cloud).query(cloud, 2)[0][:, 1]) for cloud in points]
         radius = np.linalg.norm(points - points.mean(1, keepdims=True), axis=-1).max(1)
         sharp = float(np.isfinite(file["edges"][:, 0, 0]).mean()) if contents.has_edges else None
         datasets = listing(file)

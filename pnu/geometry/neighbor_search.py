@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pnu.geometry.kd_tree import kd_tree
 from pnu.geometry.point_tree import PointTree
 
 CHUNK_ELEMENTS = 2**25  # distances held at once where neither tree nor kernel is used: 128 MiB in float32
@@ -149,8 +149,8 @@ def _ball_tree(query: Tensor, target: Tensor, radius: float, k: int) -> Tensor:
     idx = np.zeros((clouds, m, k), np.int64)
 
     def search(b: int) -> None:
-        tree = cKDTree(query[b].double().numpy())
-        pairs = tree.sparse_distance_matrix(cKDTree(target[b].double().numpy()), radius, output_type="ndarray")
+        tree = kd_tree(query[b].double().numpy())
+        pairs = tree.sparse_distance_matrix(kd_tree(target[b].double().numpy()), radius, output_type="ndarray")
         pairs = pairs[pairs["v"] < radius]
         pairs = pairs[np.argsort(pairs["i"] * target.shape[1] + pairs["j"])]
         row, column = pairs["i"], pairs["j"]

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+
+from pnu.geometry.kd_tree import kd_tree
 
 NEIGHBORS = 24
 GAP = 0.75 * np.pi  # angle without neighbors, seen from a point on a rim; 24 random ones leave it once in 2000
@@ -34,7 +35,7 @@ def open_rims(points: NDArray[np.float64]) -> list[OpenRim]:
     some = points[::step]
     if len(some) <= NEIGHBORS:
         return []
-    tree = cKDTree(some)
+    tree = kd_tree(some)
     distance, near = tree.query(some, k=NEIGHBORS + 1)
     around = some[near[:, 1:]] - some[:, None]
     centered = around - around.mean(1, keepdims=True)
@@ -45,7 +46,7 @@ def open_rims(points: NDArray[np.float64]) -> list[OpenRim]:
     if len(rows) < FEWEST:
         return []
     spacing = float(np.median(distance[:, -1])) * np.sqrt(np.pi / NEIGHBORS)
-    pairs = cKDTree(some[rows]).query_pairs(REACH * spacing, output_type="ndarray")
+    pairs = kd_tree(some[rows]).query_pairs(REACH * spacing, output_type="ndarray")
     links = coo_matrix((np.ones(len(pairs), bool), pairs.T), (len(rows), len(rows)))
     piece = connected_components(links, directed=False)[1]
     found = []

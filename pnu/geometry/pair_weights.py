@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_matrix
-from scipy.spatial import cKDTree
+
+from pnu.geometry.kd_tree import kd_tree
 
 TINY = 1e-12  # in units of the radius: two points at one place
 
@@ -35,7 +36,7 @@ def within(points: np.ndarray, targets: np.ndarray, radius: float, *, itself: bo
 
     itself: whether point i and target i, of the same cloud, are a pair.
     """
-    pairs = cKDTree(points).sparse_distance_matrix(cKDTree(targets), radius, output_type="ndarray")
+    pairs = kd_tree(points).sparse_distance_matrix(kd_tree(targets), radius, output_type="ndarray")
     if not itself:
         pairs = pairs[pairs["i"] != pairs["j"]]
     dist = np.maximum(pairs["v"], TINY * radius)

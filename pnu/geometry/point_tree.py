@@ -26,9 +26,9 @@ class PointTree:
 
             self.tree = NeighborTree(self.points)
         else:
-            from scipy.spatial import cKDTree
+            from pnu.geometry.kd_tree import kd_tree
 
-            self.plain = cKDTree(self.points)
+            self.plain = kd_tree(self.points)
 
     def nearest(
         self, queries: NDArray[np.floating], k: int, *, threads: int = 1

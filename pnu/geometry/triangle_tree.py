@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+
+from pnu.geometry.kd_tree import kd_tree
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -28,7 +29,7 @@ def closest_on_triangles(queries: Array, triangles: Array) -> Closest:
     tree = _BoxTree.of(pieces)
     # the nearest centroids give a bound on the distance that is nearly tight
     few = min(3, len(owner))
-    guess = owner[cKDTree(pieces.mean(1)).query(queries, k=np.arange(1, few + 1))[1]]
+    guess = owner[kd_tree(pieces.mean(1)).query(queries, k=np.arange(1, few + 1))[1]]
     best = _best(queries, triangles, np.repeat(np.arange(len(queries)), few), guess.ravel())
     todo = [part for part in np.split(np.arange(len(queries)), range(2**14, len(queries), 2**14)) if len(part)]
     while todo:

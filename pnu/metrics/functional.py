@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pnu.geometry.kd_tree import kd_tree
 from pnu.geometry.mesh_sampling import closest_points, face_normals
 from pnu.geometry.neighbor_search import Neighbors, knn, nearest
 from pnu.io import Mesh
@@ -220,9 +220,9 @@ def uniformity(
     values = []
     for cloud, surface in zip(_numpy(a), _numpy(b), strict=True):
         centers = surface[np.linspace(0, len(surface) - 1, min(disks, len(surface))).astype(int)]
-        radius = cKDTree(surface).query(centers, k=[k])[0][:, 0]
+        radius = kd_tree(surface).query(centers, k=[k])[0][:, 0]
         radius = radius * (1 + 1e-9)  # rounding must not drop the point on the rim
-        found, expected = (cKDTree(c).query_ball_point(centers, radius, return_length=True) for c in (cloud, surface))
+        found, expected = (kd_tree(c).query_ball_point(centers, radius, return_length=True) for c in (cloud, surface))
         values.append(np.std((found / len(cloud)) / (expected / len(surface))))
     return _squeeze(a.new_tensor(values), one)
 

@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pnu.geometry.kd_tree import kd_tree
 from pnu.metrics.declared import P2F, Flipped, Metric, NormalUnsignedDeg, Shown
 from pnu.metrics.functional import Pair
 
@@ -29,7 +29,7 @@ def scan_scores(
     to each of the cloud, and the unit normal there, (m, 3) each.
     """
     distance = np.linalg.norm(cloud[:, :3] - closest, axis=1)
-    back = cKDTree(cloud[:, :3]).query(seen)[0]
+    back = kd_tree(cloud[:, :3]).query(seen)[0]
     length = np.linalg.norm(cloud[:, 3:], axis=1) * np.linalg.norm(true, axis=1)
     cosine = np.clip((cloud[:, 3:] * true).sum(1) / np.maximum(length, 1e-300), -1, 1)
     scores: dict[str, Any] = {

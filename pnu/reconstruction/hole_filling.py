@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
+from pnu.geometry.kd_tree import kd_tree
 from pnu.geometry.mesh_sampling import face_areas, sample_poisson_disk
 from pnu.geometry.mesh_topology import vertex_normals
 from pnu.geometry.spacing import spacing
@@ -39,7 +39,7 @@ def fill_holes(cloud: Array, radius: float, *, timeout: float = 600, seed: int =
         raise ValueError(f"holes={radius:g}: expected a radius above 0 in the unit of the points")
     box = BOX + 2 * min(radius / max(np.ptp(cloud[:, :3], axis=0).max(), 1e-300), 1.0)  # a lid may stand out of it
     mesh = reconstruct(cloud[:, :3], cloud[:, 3:], box=box, timeout=timeout, name=name).mesh
-    tree, even = cKDTree(cloud[:, :3]), spacing(cloud[:, :3])
+    tree, even = kd_tree(cloud[:, :3]), spacing(cloud[:, :3])
     lids, supported = hole_faces(mesh, tree.query(mesh.vertices)[0], OPEN * even, radius)
     areas = face_areas(mesh)
     count = round(areas[lids].sum() / max(areas[supported].sum(), 1e-300) * len(cloud))
@@ -47,7 +47,7 @@ def fill_holes(cloud: Array, radius: float, *, timeout: float = 600, seed: int =
         return np.empty((0, 6))
     points = sample_poisson_disk(Mesh(mesh.vertices, mesh.faces[lids]), count, np.random.default_rng(seed))[:, :3]
     points = points[tree.query(points)[0] > ROOM * even]
-    normals = vertex_normals(mesh)[cKDTree(mesh.vertices).query(points)[1]]
+    normals = vertex_normals(mesh)[kd_tree(mesh.vertices).query(points)[1]]
     return np.hstack([points, normals])
 
 

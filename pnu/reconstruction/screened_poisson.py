@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pnu.extras import require
+from pnu.geometry.kd_tree import kd_tree
 from pnu.geometry.mesh_sampling import closest_points, face_normals, signed_volume
 from pnu.geometry.mesh_topology import open_edges
 from pnu.geometry.normal_estimation import complete_normals
@@ -94,7 +94,7 @@ def reconstruct(
     some = slice(None, None, -(-len(points) // 2000))
     _, off, face = closest_points(mesh, points[some])
     away = (given[some] * face_normals(mesh)[face]).sum(1) * (-1 if inside_out else 1) < 0
-    alone = cKDTree(points).query(mesh.vertices, distance_upper_bound=far)[0] > far
+    alone = kd_tree(points).query(mesh.vertices, distance_upper_bound=far)[0] > far
     shares = (float(np.mean(share)) for share in (off > far, alone, away))
     return ReconstructedSurface(mesh, found["density"], depth, inside_out, *shares)
 
@@ -158,7 +158,7 @@ def cut_off(surface: ReconstructedSurface, points: np.ndarray, reach: float) -> 
     """
     if not reach > 0:
         raise ValueError(f"reach={reach:g}: expected a number of spacings above 0, such as 4")
-    distance, nearest = cKDTree(points[:, :3]).query(surface.mesh.vertices)
+    distance, nearest = kd_tree(points[:, :3]).query(surface.mesh.vertices)
     around = local_spacing(points)
     keep = distance <= reach * np.maximum(around, np.median(around))[nearest]
     return part_of(surface, keep, f"reach={reach:g}", "a larger one")._replace(made_up=0.0)
@@ -179,7 +179,7 @@ def part_of(surface: ReconstructedSurface, keep: NDArray[np.bool_], key: str, cu
 
 def interpolated_values(points: np.ndarray, values: np.ndarray, query: np.ndarray, k: int = 4) -> Array:
     """Values `(n, c)` of points `(n, 3)`, such as colors, at `query` `(m, 3)`: k nearest, by inverse distance."""
-    far, near = cKDTree(points).query(query, k=np.arange(1, min(k, len(points)) + 1))
+    far, near = kd_tree(points).query(query, k=np.arange(1, min(k, len(points)) + 1))
     weight = 1 / (far + 1e-9 * (far.max() or 1.0))
     mean: Array = (weight[..., None] * np.asarray(values, np.float64)[near]).sum(1) / weight.sum(1, keepdims=True)
     return mean

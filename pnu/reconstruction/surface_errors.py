@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from pnu.geometry.kd_tree import kd_tree
 from pnu.geometry.mesh_sampling import closest_points, face_normals, sample_area
 from pnu.geometry.mesh_topology import vertex_normals
 from pnu.io import Mesh
@@ -65,7 +65,7 @@ def check_frame(points: np.ndarray, truth: Mesh, *, name: str = "cloud", truth_n
     """
     radius = box_radius(truth)
     surface = sample_area(truth, 20_000, np.random.default_rng(0))[:, :3]  # fine enough for 5 %, and fast anywhere
-    off = float(np.median(cKDTree(surface).query(points[:: -(-len(points) // 1000)])[0]))
+    off = float(np.median(kd_tree(surface).query(points[:: -(-len(points) // 1000)])[0]))
     if off > ELSEWHERE * radius:
         used = truth.vertices[np.unique(truth.faces)]
         centers = [(p.min(0) + p.max(0)) / 2 for p in (points, used)]

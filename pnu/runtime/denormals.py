@@ -18,10 +18,26 @@ def are_zero() -> bool:
 @contextmanager
 def as_zero() -> Iterator[None]:
     """Take them for zero in this thread, and in those that `pnu.runtime.threads` works on; as it was in the end."""
+    with _set(True):
+        yield
+
+
+@contextmanager
+def as_numbers() -> Iterator[None]:
+    """Take them for what they are in this thread; as it was in the end."""
+    if not are_zero():
+        yield
+        return
+    with _set(False):
+        yield
+
+
+@contextmanager
+def _set(zero: bool) -> Iterator[None]:
     import torch
 
     before = are_zero()
-    torch.set_flush_denormal(True)
+    torch.set_flush_denormal(zero)
     try:
         yield
     finally:

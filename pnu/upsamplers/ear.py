@@ -5,6 +5,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pnu.geometry.kd_tree import kd_tree
 from pnu.geometry.noise_level import noise_level
 from pnu.geometry.pair_weights import Within, theta, within
 from pnu.geometry.spacing import spacing
@@ -109,7 +110,7 @@ def inserted(
     Places are the midpoints of neighbors. The paper inserts the one of greatest priority and looks again; here one
     round fills those of the greatest that lie apart from each other.
     """
-    tree = cKDTree(points)
+    tree = kd_tree(points)
     ends = neighbor_pairs(tree)
     facing = (normals[ends[:, 0]] * normals[ends[:, 1]]).sum(1) > OPPOSED
     ends = ends[facing] if facing.any() else ends

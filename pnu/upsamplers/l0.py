@@ -4,9 +4,9 @@ import numpy as np
 import torch
 from scipy.sparse import csr_matrix, identity
 from scipy.sparse.linalg import splu
-from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pnu.geometry.kd_tree import kd_tree
 from pnu.geometry.spacing import spacing
 from pnu.upsamplers.context import Context
 from pnu.upsamplers.ear import unit
@@ -54,7 +54,7 @@ class L0:
 
 def directed_edges(points: np.ndarray, k: int) -> np.ndarray:
     """(e, 2): each point and each of its k nearest others."""
-    near = cKDTree(points).query(points, k=min(k + 1, len(points)))[1]
+    near = kd_tree(points).query(points, k=min(k + 1, len(points)))[1]
     edges = np.stack([np.repeat(np.arange(len(points)), near.shape[1]), near.ravel()], 1)
     found: np.ndarray = edges[edges[:, 0] != edges[:, 1]]
     return found
