@@ -50,6 +50,34 @@ def test_whole_numbers_are_rounded() -> None:
     assert carry(dense, sparse, np.array([0, 100]))[0] == round(100 * (1 - share)) == 16
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.int64, np.float64, np.str_, np.bool_])
+def test_kinds_have_no_mean(kind: type) -> None:
+    """Ground (2) beside a building (6) is no vegetation (4): what has the greater weight around a point."""
+    sparse, dense = plane(400), plane(300)
+    classes = np.where(sparse[:, 0] < 0.5, 2, 6).astype(np.uint8)
+    if kind is np.bool_:
+        values = classes > 2
+    else:
+        values = classes.astype(kind)
+    carried = carry(dense, sparse, values)
+    assert carried.dtype == values.dtype
+    assert set(carried) == set(values)
+    clear = abs(dense[:, 0] - 0.5) > 0.1
+    expected = values[np.where(dense[:, 0] < 0.5, classes.argmin(), classes.argmax())]
+    np.testing.assert_array_equal(carried[clear], expected[clear])
+
+
+def test_the_kind_of_the_greatest_weight() -> None:
+    """Two neighbors of a kind a little farther away outweigh a single one of another."""
+    sparse = np.zeros((100, 6))
+    sparse[:, 5], sparse[:, 0] = 1, np.arange(100) + 10.0
+    sparse[:3, 0] = [0.9, -1, -1.01]
+    kinds = np.ones(100, np.uint16)
+    kinds[0] = 9
+    assert carry(np.array([[0.0, 0, 0, 0, 0, 1]]), sparse, kinds)[0] == 1
+    assert carry(np.array([[0.4, 0, 0, 0, 0, 1]]), sparse, kinds)[0] == 9
+
+
 def test_point_that_faces_no_neighbor_takes_the_nearest() -> None:
     sparse, dense = plane(10), plane(5, up=-1.0)
     nearest = np.linalg.norm(dense[:, None, :3] - sparse[:, :3], axis=2).argmin(1)
