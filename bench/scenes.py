@@ -76,6 +76,14 @@ def scanned_room(place: Array, rays: int = 6000) -> tuple[Array, Array]:
     return points, normals
 
 
+def rescanned_room() -> tuple[Array, Array, Array, Array]:
+    """The same from two places: also the place of each point's scanner (n, 3), and which scan it is of (n,)."""
+    places = np.array([[2, 2.4, 1.5], [5.2, 3.1, 1.6]])
+    scans = [scanned_room(place) for place in places]
+    number = np.repeat([0, 1], [len(points) for points, _ in scans])
+    return np.vstack([points for points, _ in scans]), np.vstack([n for _, n in scans]), places[number], number
+
+
 def room() -> tuple[Array, Array]:
     """Of eight by five by three meters, with a chest on the floor and a pillar: normals look into the air."""
     walls, outward = box(6000, (8, 5, 3), (0, 0, 1.5))

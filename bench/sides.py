@@ -1,10 +1,11 @@
 """Normals on the wrong side, in percent: `python -m bench.sides MESHES [--seed 1] [--output outputs/sides]`.
 
 *flipped*: 5000 points of each mesh with normals, a quarter of them turned over in patches, to be repaired, axes kept.
-*oneview*: each mesh as a depth camera sees it, and three scenes as points alone, of which the sensor's place or the
-direction from above is known. "before" are the given signs, or those of `pnu.normals(points)`, which knows no sensor;
-"cosine" turns each normal by itself to what saw it; "open3d" is its consistent tangent planes, the better side of two,
-or its own normals turned to the camera or upward. Of scans the stray points, which have no normal, don't count.
+*oneview*: each mesh as a depth camera sees it, and scenes as points alone, of which the sensor's place or the
+direction from above is known, or which of two scans each point is of. "before" are the given signs, or those of
+`pnu.normals(points)`, which knows no sensor; "cosine" turns each normal by itself to what saw it; "open3d" is its
+consistent tangent planes, the better side of two, or its own normals turned to what saw them or upward. Of scans the
+stray points, which have no normal, don't count.
 """
 
 import argparse
@@ -16,7 +17,7 @@ import numpy as np
 import open3d
 
 import pnu
-from bench.scenes import corridor, land, room, scanned_room, yard
+from bench.scenes import corridor, land, rescanned_room, room, scanned_room, yard
 from pnu.benchmark.cases import generator
 from pnu.data import shapes
 from pnu.data.scanner import KINDS, Scanner
@@ -32,8 +33,9 @@ class Case(NamedTuple):
     points: np.ndarray
     true: np.ndarray  # normals, NaN where a point has none
     given: np.ndarray | None = None
-    viewpoint: np.ndarray | None = None
+    viewpoint: np.ndarray | None = None  # (3,), or of each point
     up: np.ndarray | None = None
+    scans: np.ndarray | None = None  # known instead of the viewpoint
 
 
 def cases(meshes: Path, seed: int) -> Iterator[Case]:
@@ -53,6 +55,9 @@ def cases(meshes: Path, seed: int) -> Iterator[Case]:
         ("corridor, from one end", corridor(), {"viewpoint": np.array([-3, 0, 0.2])}),
     ):
         yield Case(name, points + 0.01 * rng.normal(size=points.shape), true, **sight)
+    points, true, places, scans = rescanned_room()
+    points = points + 0.01 * rng.normal(size=points.shape)
+    yield Case("room scanned twice, the scans told apart", points, true, viewpoint=places, scans=scans)
 
 
 def by_cosine(case: Case, normals: np.ndarray) -> np.ndarray:
@@ -68,11 +73,14 @@ def by_open3d(case: Case) -> np.ndarray:
         found = np.asarray(cloud.normals)
         return -found if wrong(found, case.true) > 50 else found
     cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(NEIGHBORS))
-    if case.viewpoint is not None:
-        cloud.orient_normals_towards_camera_location(case.viewpoint)
-    else:
+    if case.viewpoint is None:
         cloud.orient_normals_to_align_with_direction(case.up)
-    return np.asarray(cloud.normals)
+        return np.asarray(cloud.normals)
+    found = np.array(cloud.normals)
+    for place in np.unique(np.atleast_2d(case.viewpoint), axis=0):
+        cloud.orient_normals_towards_camera_location(place)
+        found = np.where((case.viewpoint == place).all(-1, keepdims=True), np.asarray(cloud.normals), found)
+    return found
 
 
 def wrong(normals: np.ndarray, true: np.ndarray) -> float:
@@ -84,6 +92,8 @@ def wrong(normals: np.ndarray, true: np.ndarray) -> float:
 def measured(case: Case, folder: Path) -> dict[str, float]:
     before = pnu.normals(case.points) if case.given is None else case.given
     keys: dict[str, Any] = {"viewpoint": case.viewpoint, "up": case.up}
+    if case.scans is not None:
+        keys = {"scans": case.scans}
     ours = pnu.normals(case.points, case.given, **keys)
     for stage, normals in (("before", before), ("after", ours)):
         write_cloud(folder / f"{case.name.partition(',')[0].replace(' ', '_')}_{stage}.ply", case.points, normals)

@@ -13,7 +13,7 @@ from pnu.geometry.single_view import camera_place
 from pnu.geometry.spacing import spacing
 from pnu.io import Cloud
 from pnu.io.cloud import chosen
-from pnu.io.sensor import Sight
+from pnu.io.sensor import Sight, scan_numbers
 
 Treatment = Literal["auto", "keep"]
 TREATMENTS = ("auto", "keep")
@@ -76,7 +76,7 @@ def clean_cloud(
         )
         cloud = chosen(cloud, rows)._replace(points=averaged(cloud.points, rows))
     if signs == "auto" and cloud.normals is not None and contradiction(cloud.points, cloud.normals):
-        settled = settled_normals(cloud.points, cloud.normals)
+        settled = settled_normals(cloud.points, cloud.normals, scans=scan_numbers(cloud.attributes))
         notes.append(f"normals: {settled.words} (normals=keep)")
         cloud = cloud._replace(normals=settled.normals)
     share = len(stray) / (len(stray) + len(cloud.points))
@@ -88,7 +88,7 @@ def clean_cloud(
         return scanned._replace(character="scanned")
     if not is_noisy(cloud.points):  # nor has it thin walls, whose sides normals tell apart
         return scanned
-    estimated = settled_normals(cloud.points, None, found=found.sight)
+    estimated = settled_normals(cloud.points, None, found=found.sight, scans=scan_numbers(cloud.attributes))
     if is_noisy(cloud.points, estimated.normals):
         return found._replace(character=noisy_character(cloud.points), estimated=estimated)
     return scanned._replace(estimated=estimated)

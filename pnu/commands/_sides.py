@@ -35,7 +35,7 @@ def sided(cfg: Any, cloud: "Cloud", *, learned: bool = True, places: "Sight | No
     """A normal for each point of a cloud, as the keys and the file say. Without `learned` those that are estimated are
     plane fits. places: what those of the points say, where that is known already."""
     from pnu.geometry.cloud_normals import settled_normals
-    from pnu.io.sensor import asked_sight, sight_of
+    from pnu.io.sensor import asked_sight, scan_numbers, sight_of
     from pnu.upsamplers.learned_normals import learned_normals
 
     with stages(cfg.quiet) as progress:
@@ -45,6 +45,7 @@ def sided(cfg: Any, cloud: "Cloud", *, learned: bool = True, places: "Sight | No
             choice=cfg.normals,
             asked=asked_sight(cfg.viewpoint, cfg.up, cfg.side),
             found=sight_of(cfg.input, cloud.attributes) or places,
+            scans=scan_numbers(cloud.attributes),
             refine=learned_normals if learned else None,
             progress=progress,
         )

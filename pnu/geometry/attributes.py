@@ -28,7 +28,7 @@ def carry(dense: np.ndarray, sparse: np.ndarray, values: np.ndarray) -> np.ndarr
     weight[lost, 0] = 1
     weight /= weight.sum(1, keepdims=True)
     if (kinds := _kinds(values)) is not None:
-        return values[idx[np.arange(len(dense)), _heaviest(weight, kinds[idx])]]
+        return np.asarray(values[idx[np.arange(len(dense)), _heaviest(weight, kinds[idx])]])
     mean: np.ndarray = np.einsum("mk,mk...->m...", weight, values[idx].astype(np.float64))
     if np.issubdtype(values.dtype, np.integer):
         mean = mean.round()
@@ -49,4 +49,4 @@ def _kinds(values: np.ndarray) -> np.ndarray | None:
 def _heaviest(weight: np.ndarray, kinds: np.ndarray) -> np.ndarray:
     """Of neighbors with weights and kinds (m, k) the number of the first whose kind has the greatest weight, (m,)."""
     votes = [(weight * (kinds == kind[:, None])).sum(1) for kind in kinds.T]
-    return np.stack(votes, 1).argmax(1)
+    return np.asarray(np.stack(votes, 1).argmax(1))

@@ -8,7 +8,7 @@ import numpy as np
 from pnu.geometry.cloud_statistics import CONTRADICTING, contradicting
 from pnu.geometry.flipped_parts import flipped_share
 from pnu.geometry.normal_estimation import complete_normals, orient_normals
-from pnu.geometry.normal_sides import repaired_signs, seen_signs
+from pnu.geometry.normal_sides import hidden, repaired_signs, seen_signs
 from pnu.geometry.orientation import NeighborCloud, gauss_law
 from pnu.geometry.scanner_within import scanner_within
 from pnu.geometry.single_view import camera_place, is_camera, seen_from_one_side
@@ -24,6 +24,7 @@ ONE_SIDE, FROM_ABOVE = "to where all of it was seen from, one side", "up, as lan
 GROUND = "up, as ground and what stands on it"
 UP = np.array([0.0, 0.0, 1.0])
 LEVEL = 0.7  # height of the mean normal of what is mostly ground
+TELLING, MISSED = 1000, 0.15  # points of a sensor that tell whether it saw them, and their share that it may not have
 AGAINST = 0.2  # as much may Gauss' law speak for the other side: things on a ground are open below
 
 
@@ -42,6 +43,7 @@ def settled_normals(
     choice: Choice = "auto",
     asked: Sight | None = None,
     found: Sight | None = None,
+    scans: np.ndarray | None = None,
     neighbors: int = 16,
     refine: Refine | None = None,
     progress: Progress = silent,
@@ -54,7 +56,8 @@ def settled_normals(
             "keep": as they are; "estimate": none of those given. What is missing is estimated.
         asked: what shall decide the side of all that are not kept.
         found: what the file says; it decides where nothing is asked and given signs don't agree, or there are none;
-            where it says nothing, `sight_by_places`.
+            where it says nothing, `sight_by_places`. Sensors from which much is hidden are not believed.
+        scans: (n,) which scan each point is of, if that is known: the scanner of each is looked for by itself.
         neighbors: of the plane fits that estimates begin with.
         refine: what makes better ones of those that are estimated.
         progress: called as progress(stage, done, total).
@@ -76,10 +79,14 @@ def settled_normals(
     lines = complete_normals(unit, given, neighbors)
     if refine is not None and not known.all():
         lines = np.where(known[:, None], lines, refine(unit, lines, progress))
+    doubt = ""
+    if asked is None and found is not None and found.viewpoint is not None and found.viewpoint.ndim == 2:
+        found, doubt = _believed(found, points, _in_order(lines, order))
     sight = asked or found or sight_by_places(points)
     if sight is None and (anew[known].any() or not known.any()):
-        place = scanner_within(points[order], lines)
-        sight = None if place is None else scanner_sight(place, frame.scale.item())
+        sight = sight_from_within(points[order], lines, None if scans is None else scans[order])
+        if sight is not None and sight.viewpoint is not None and sight.viewpoint.ndim == 2:
+            sight = sight._replace(viewpoint=_in_order(sight.viewpoint, order))
     if sight is not None and sight.viewpoint is not None:
         of_each = sight.viewpoint.ndim == 2
         places = sight.viewpoint[order] if of_each else sight.viewpoint
@@ -90,7 +97,7 @@ def settled_normals(
     sign = np.where(anew, sign, 1)
     settled = np.empty(points.shape)
     settled[order] = lines * sign[:, None]
-    return Settled(settled, _words(known, int((sign[known] < 0).sum()), why, side), side)
+    return Settled(settled, _words(known, int((sign[known] < 0).sum()), why, side + doubt), side)
 
 
 def check_not_a_line(points: np.ndarray) -> None:
@@ -132,6 +139,22 @@ def scanner_sight(place: np.ndarray, radius: float) -> Sight:
     return Sight(f"towards a scanner within, at about {where}, from which they thin out", viewpoint=place)
 
 
+def sight_from_within(points: np.ndarray, lines: np.ndarray, scans: np.ndarray | None = None) -> Sight | None:
+    """That of the scanner amid points (n, 3) with unit lines (n, 3), or of each of the scans (n,) that they are of."""
+    if scans is None:
+        place = scanner_within(points, lines)
+        return None if place is None else scanner_sight(place, float(np.ptp(points, axis=0).max()) / 2)
+    places, count = np.full(points.shape, np.nan), 0
+    for scan in np.unique(scans):
+        rows = np.flatnonzero(scans == scan)
+        place = camera_place(points[rows])
+        place = scanner_within(points[rows], lines[rows]) if place is None else place
+        if place is not None:
+            places[rows], count = place, count + 1
+    words = f"towards the scanners of {count} scan{'s' * (count > 1)}, found by their points"
+    return Sight(words, viewpoint=places) if count else None
+
+
 def camera_words(place: np.ndarray) -> str:
     """Such a camera and about where it is."""
     return f"camera at {','.join(f'{value:.3g}' for value in place) if place.any() else 'the origin'}"
@@ -144,6 +167,32 @@ def is_height_map(points: np.ndarray) -> bool:
         return False
     cells = np.searchsorted(x, points[:, 0]) * len(y) + np.searchsorted(y, points[:, 1])
     return len(np.unique(cells)) == len(points)
+
+
+def _in_order(sorted_values: np.ndarray, order: np.ndarray) -> np.ndarray:
+    """Values (n, c) of points sorted by an order (n,), as the points came."""
+    values = np.empty_like(sorted_values)
+    values[order] = sorted_values
+    return values
+
+
+def _believed(found: Sight, points: np.ndarray, lines: np.ndarray) -> tuple[Sight | None, str]:
+    """What a file says of the sensor of each of points (n, 3) with lines (n, 3), without those that can't be, and that
+    in words."""
+    assert found.viewpoint is not None
+    places = np.array(found.viewpoint, np.float64)
+    known = np.isfinite(places).all(1)
+    different, number = np.unique(places[known], axis=0, return_inverse=True)
+    refuted = np.zeros(len(points), bool)
+    for place, count in enumerate(np.bincount(number.ravel(), minlength=len(different))):
+        rows = np.flatnonzero(known)[number.ravel() == place]
+        if count >= TELLING and hidden(points[rows], lines[rows], different[place]).mean() > MISSED:
+            refuted[rows] = True
+    if not refuted.any():
+        return found, ""
+    places[refuted] = np.nan
+    doubt = f"; what the file says of the sensors of {refuted.sum()} points can't be: these hide each other from there"
+    return (found._replace(viewpoint=places) if np.isfinite(places).any() else None), doubt
 
 
 def _signs(

@@ -193,8 +193,9 @@ def _read_text(path: Path, columns: Sequence[str] | None = None) -> Cloud:
 
 
 def _read_ptx(path: Path, columns: Sequence[str] | None = None) -> Cloud:
-    values, names, notes = read_ptx(path)
-    return _from_table(path, values, names if columns is None else list(columns), notes)
+    (values, names, notes), of_scans = read_ptx(path)
+    cloud = _from_table(path, values, names if columns is None else list(columns), notes)
+    return cloud._replace(attributes=cloud.attributes | of_scans)
 
 
 def _read_array(path: Path, columns: Sequence[str] | None = None) -> Cloud:

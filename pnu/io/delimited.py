@@ -10,6 +10,7 @@ import numpy as np
 
 from pnu.io.columns import SKIP
 from pnu.io.fields import DEGREES, POINTS
+from pnu.io.sensor import columns_of_scans
 from pnu.io.text import table, text_lines
 
 SAMPLE = 100  # lines that tell how a file is written
@@ -215,10 +216,13 @@ def _counted(path: Path, values: np.ndarray, count: int) -> tuple[np.ndarray, li
     return values, []
 
 
-def read_ptx(path: Path) -> Text:
-    """Scans on a grid, each with its place: two counts, four lines of the scanner, four of the matrix, the points."""
+def read_ptx(path: Path) -> tuple[Text, dict[str, np.ndarray]]:
+    """Scans on a grid, each with its place: two counts, four lines of the scanner, four of the matrix, the points.
+
+    And `columns_of_scans`: a scan stands where the matrix moves it, else where its first line says.
+    """
     lines = text_lines(path)
-    scans, lost, width = [], 0, 0
+    scans, places, lost, width = [], [], 0, 0
     while head := list(islice((line for line in lines if line.strip()), 10)):
         try:
             size = int(head[0]) * int(head[1])
@@ -244,9 +248,11 @@ def read_ptx(path: Path) -> Text:
         scan = values[seen]
         scan[:, :3] = scan[:, :3] @ matrix[:3, :3] + matrix[3, :3]
         scans.append(scan)
+        place = np.array([float(word) for word in head[2].split()])
+        places.append(matrix[3, :3] if matrix[3, :3].any() else place)
     if not scans:
         raise ValueError(f"{path}: holds no points; expected ptx")
     notes = [f"{lost} of {lost + sum(map(len, scans))} points left out: no return"] if lost else []
     notes += [f"{len(scans)} scans, each moved to its place"] if len(scans) > 1 else []
     names = {4: ["x", "y", "z", "intensity"], 7: ["x", "y", "z", "intensity", "red", "green", "blue"]}.get(width)
-    return Text(np.vstack(scans), names, tuple(notes))
+    return Text(np.vstack(scans), names, tuple(notes)), columns_of_scans([len(scan) for scan in scans], places)

@@ -9,6 +9,7 @@ import numpy as np
 
 from pnu.extras import require
 from pnu.io import e57_child
+from pnu.io.sensor import columns_of_scans
 
 SECONDS = 600
 NAMES = {
@@ -18,7 +19,8 @@ NAMES = {
 
 
 def read_e57(path: Path) -> dict[str, np.ndarray]:
-    """Columns (n,): x y z float64 as the scans are placed, intensity, and red green blue, where all scans have them."""
+    """Columns (n,): x y z float64 as the scans are placed, intensity, and red green blue, where all scans have them;
+    and `columns_of_scans`."""
     require("pye57", f"{path}: reading e57")
     command = [sys.executable, "-I", e57_child.__file__, str(path)]
     try:
@@ -30,4 +32,5 @@ def read_e57(path: Path) -> dict[str, np.ndarray]:
     except (ValueError, OSError, subprocess.TimeoutExpired) as error:
         reason = " ".join(str(error).split())[:80]
         raise ValueError(f"{path}: is no e57 file that can be read ({reason}); export it again") from None
-    return {NAMES.get(name, name): values for name, values in found.items()}
+    of_scans = columns_of_scans(found.pop("sizes").tolist(), list(found.pop("places")))
+    return of_scans | {NAMES.get(name, name): values for name, values in found.items()}

@@ -1,4 +1,5 @@
-"""The process that reads e57: `python -I e57_child.py FILE`, the columns of all scans to stdout, as npz.
+"""The process that reads e57: `python -I e57_child.py FILE`, the columns of all scans to stdout, as npz, and the scans'
+"sizes" and "places".
 
 On its own, and not a part of the program that calls it, because the library ends its process on some damaged files.
 """
@@ -20,7 +21,7 @@ def main(source: str) -> None:
 
     _limit_memory(ROOM + 8 * Path(source).stat().st_size)
     file = pye57.E57(source)
-    scans = []
+    scans, places = [], []
     for number in range(file.scan_count):
         head = file.get_header(number)
         if head.point_count > MOST * Path(source).stat().st_size:
@@ -31,10 +32,12 @@ def main(source: str) -> None:
                 number, intensity="intensity" in known, colors="colorRed" in known, ignore_missing_fields=True
             )
         )
+        places.append(head.translation)
     if not scans:
         raise ValueError("it holds no scan")
     common = [name for name in COLUMNS if all(name in scan for scan in scans)]
     columns: dict[str, Any] = {name: np.concatenate([scan[name] for scan in scans]) for name in common}
+    columns["sizes"], columns["places"] = [len(scan["cartesianX"]) for scan in scans], places
     np.savez(buffer := io.BytesIO(), **columns)
     sys.stdout.buffer.write(buffer.getvalue())
 

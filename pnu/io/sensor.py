@@ -1,6 +1,6 @@
 """Where a cloud was seen from, as far as its file says so."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +14,7 @@ PLACES = tuple(
     tuple(f"{name}{axis}" for axis in "xyz")
     for name in ("sensor_", "vp_", "viewpoint_", "scanner_", "sensor_origin_", "camera_", "sensor", "vp")
 )
+SCANS = frozenset({"scan", "scanid", "scanindex", "scannumber", "pointsourceid", "station", "stationid"})
 AXES = {f"{minus}{'xyz'[axis]}": (-1) ** len(minus) * np.eye(3)[axis] for minus in ("", "-") for axis in range(3)}
 
 
@@ -41,6 +42,31 @@ def sight_of(path: str | Path, attributes: Mapping[str, np.ndarray]) -> Sight | 
         return Sight(f"towards the file's VIEWPOINT {spelled_place(place)}", viewpoint=place)
     if suffix in (".las", ".laz") and is_from_the_air(Path(path)):
         return Sight("up, as seen from the air (scan angles or several returns)", up=np.array([0.0, 0, 1]))
+    return None
+
+
+def columns_of_scans(
+    sizes: Sequence[int] | np.ndarray, places: Sequence[np.ndarray] | np.ndarray
+) -> dict[str, np.ndarray]:
+    """Of points (n,) that come scan by scan: "scan", its number, and "sensor_x" ..., where it stood, NaN if at 0 0 0.
+
+    That is where files put scans of which they do not know it. A single scan has no number; without places, none.
+    """
+    columns: dict[str, np.ndarray] = {}
+    if len(sizes) > 1:
+        columns["scan"] = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)
+    told = np.where(np.any(places, axis=1, keepdims=True), places, np.nan)
+    if not np.isnan(told).all():
+        columns |= {name: np.repeat(column, sizes) for name, column in zip(PLACES[0], told.T, strict=True)}
+    return columns
+
+
+def scan_numbers(attributes: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Which scan each point is of, (n,), where columns say so and there are several."""
+    for name, values in attributes.items():
+        if name.lower().removeprefix("scalar_").replace("_", "") in SCANS and values.ndim == 1:
+            different, number = np.unique(values, return_inverse=True)
+            return np.asarray(number) if len(different) > 1 else None
     return None
 
 

@@ -24,18 +24,17 @@ from pnu.cleaning import Character, is_noisy, stray_points
 from pnu.cleaning.outliers import MANY
 from pnu.geometry.anisotropy import thinned_lines
 from pnu.geometry.cells import Cells
-from pnu.geometry.cloud_normals import contradiction, is_height_map, scanner_sight, settled_normals
+from pnu.geometry.cloud_normals import contradiction, is_height_map, settled_normals, sight_from_within
 from pnu.geometry.cloud_statistics import FAINT
 from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.normal_estimation import complete_normals
 from pnu.geometry.point_tree import PointTree
-from pnu.geometry.scanner_within import scanner_within
 from pnu.geometry.spacing import local_spacing
 from pnu.io import atomic_path, read_json, write_json
 from pnu.io.cloud import ORIGIN, UNSEEN, Cloud, first_of_each_place, looks_geographic, unit_normals
 from pnu.io.fields import GEOGRAPHIC, as_colors
 from pnu.io.point_stream import in_range, is_geographic, point_slices
-from pnu.io.sensor import Sight, asked_sight, sight_of
+from pnu.io.sensor import Sight, asked_sight, scan_numbers, sight_of
 from pnu.runtime.progress import Progress, silent
 from pnu.upsamplers.surface_projection import is_even, noise_in_spacings
 
@@ -426,10 +425,13 @@ def _coarse_cloud(folder: Path, keys: Keys, facts: Facts, full: list[int]) -> No
     rows = np.concatenate([np.asarray(part) for part in parts])
     asked, found = asked_sight(keys.viewpoint, keys.up, keys.side), None
     if len(rows) > COARSE:
+        kept = farthest_points_large(rows["point"], COARSE)
         if asked is None and not facts.given:  # whoever scanned it shows in what is not even yet
-            place = scanner_within(rows["point"], complete_normals(rows["point"], None))
-            found = None if place is None else scanner_sight(place, float(np.ptp(rows["point"], axis=0).max()))
-        rows = rows[farthest_points_large(rows["point"], COARSE)]
+            lines, scans = complete_normals(rows["point"], None), scan_numbers(attributes_of(rows))
+            found = sight_from_within(rows["point"], lines, scans)
+            if found is not None and scans is not None and found.viewpoint is not None:
+                found = found._replace(viewpoint=found.viewpoint[kept])
+        rows = rows[kept]
     settled = settled_normals(
         rows["point"], rows["normal"] if facts.given else None,
         choice=keys.normals if keys.normals != "auto" or not facts.turned else "orient",  # type: ignore[arg-type]

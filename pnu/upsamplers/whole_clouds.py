@@ -353,6 +353,7 @@ def normals(
     viewpoint: np.ndarray | Sequence[float] | None = None,
     up: str | np.ndarray | Sequence[float] | None = None,
     side: Literal["out", "in"] | None = None,
+    scans: np.ndarray | Sequence[int] | None = None,
     neighbors: int = 16,
     progress: Progress = silent,
 ) -> CloudT: ...
@@ -366,6 +367,7 @@ def normals(
     viewpoint: np.ndarray | Sequence[float] | None = None,
     up: str | np.ndarray | Sequence[float] | None = None,
     side: Literal["out", "in"] | None = None,
+    scans: np.ndarray | Sequence[int] | None = None,
     neighbors: int = 16,
     progress: Progress = silent,
 ) -> np.ndarray: ...
@@ -378,6 +380,7 @@ def normals(
     viewpoint: np.ndarray | Sequence[float] | None = None,
     up: str | np.ndarray | Sequence[float] | None = None,
     side: Literal["out", "in"] | None = None,
+    scans: np.ndarray | Sequence[int] | None = None,
     neighbors: int = 16,
     progress: Progress = silent,
 ) -> Any:
@@ -395,6 +398,7 @@ def normals(
             look to where they were seen from.
         up: the direction from which all was seen, as from the air: "z", "-z", "x" ..., or three numbers.
         side: "out" or "in", of closed shapes, such as rooms and tunnels; on open ones "in" is the other side.
+        scans: (n,) numbers, which scan each point is of: the scanner of each is looked for by itself.
         neighbors: of the plane fits that begin it, at least 3.
         progress: called as progress(stage, done, total).
 
@@ -424,15 +428,25 @@ def normals(
         if asked.viewpoint.shape != array.shape:
             raise ValueError(f"viewpoint: expected (3,) or {array.shape}, found shape {asked.viewpoint.shape}")
         places = {"viewpoint": asked.viewpoint}
+    if scans is not None:
+        if np.shape(scans) != array.shape[:1]:
+            raise ValueError(f"scans: expected a number for each of {len(array)} points, found shape {np.shape(scans)}")
+        places["scans"] = np.asarray(scans)
     cloud = check_cloud(Cloud(array, given, places), "points", minimum=MINIMUM)
-    if asked is not None and places:
+    if asked is not None and "viewpoint" in places:
         asked = asked._replace(viewpoint=cloud.attributes["viewpoint"])
     if not (isinstance(neighbors, Integral) and 3 <= neighbors <= len(cloud.points)):
         raise ValueError(
             f"neighbors={neighbors}: expected a whole number from 3 to {len(cloud.points)}, the different points"
         )
     settled = settled_normals(
-        cloud.points, cloud.normals, asked=asked, neighbors=int(neighbors), refine=learned_normals, progress=progress
+        cloud.points,
+        cloud.normals,
+        asked=asked,
+        scans=cloud.attributes.get("scans"),
+        neighbors=int(neighbors),
+        refine=learned_normals,
+        progress=progress,
     )
     finite = np.isfinite(array).all(1)
     found = np.full(array.shape, np.nan)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.scenes import rescanned_room
 from pnu.commands.normals import main
 from pnu.geometry.mesh_sampling import signed_volume
 from pnu.io import read_cloud, read_mesh, write_cloud
@@ -330,3 +331,30 @@ def test_what_cannot_be_used_is_left_out_and_said(place: Path, capsys: pytest.Ca
     assert "1 of 610 points left out: NaN" in out
     assert "10 of 609 points left out: at the place of another" in out
     np.testing.assert_array_equal(read_cloud("out.ply").attributes["number"], np.delete(np.arange(600), 7))
+
+
+@pytest.mark.parametrize(
+    ("told", "side"),
+    [
+        (1, "towards the sensors of sensor_x sensor_y sensor_z"),
+        (0, "towards the scanners of 2 scans, found by their points"),
+    ],
+)
+def test_two_scans_of_a_room_look_into_it(tmp_path: Path, told: int, side: str) -> None:
+    """From a file that says where each scan stood, or that has them moved already and only keeps them apart."""
+    points, true, places, scans = rescanned_room()
+    lines = []
+    for number in (0, 1):
+        rows = scans == number
+        place = told * places[rows][0]
+        head = [str(rows.sum()), "1", "0 0 0", "1 0 0", "0 1 0", "0 0 1", "1 0 0 0", "0 1 0 0", "0 0 1 0"]
+        lines += [*head, " ".join(map(str, [*place, 1]))]
+        lines += [f"{x:.6f} {y:.6f} {z:.6f} 0.5" for x, y, z in points[rows] - place]
+    (tmp_path / "room.ptx").write_text("\n".join(lines))
+    done = ran(main, tmp_path, "input=room.ptx", "output=out.ply")
+    assert done.returncode == 0, done.stderr
+    assert f"side: {side}" in done.stdout
+    found = read_cloud(tmp_path / "out.ply")
+    assert found.normals is not None
+    assert ((found.normals * true).sum(1) > 0).mean() > 0.98
+    assert set(found.attributes["scan"]) == {0, 1}

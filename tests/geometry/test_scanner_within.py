@@ -6,13 +6,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import pnu
-from bench.scenes import scanned_room, yard
+from bench.scenes import rescanned_room, scanned_room, yard
 from pnu.data import shapes
 from pnu.data.scanner import KINDS, Scanner
 from pnu.geometry.cloud_normals import GROUND, settled_normals
 from pnu.geometry.normal_estimation import complete_normals
 from pnu.geometry.scanner_within import scanner_within
 from pnu.geometry.sphere_directions import sphere_directions
+from pnu.io.sensor import Sight
 
 Array = NDArray[np.float64]
 SIZE = np.array([6.0, 4.0, 3.0])  # of the scanned room
@@ -58,6 +59,32 @@ def test_the_same_room_sampled_evenly_is_a_box_that_looks_outward() -> None:
     assert scanner_within(points, complete_normals(points, None, 16)) is None
     outward = (pnu.normals(points) * (points - SIZE / 2)).sum(1)
     assert (outward > 0).mean() > 0.98
+
+
+def test_of_several_scanners_each_is_found_where_the_scans_are_told_apart() -> None:
+    points, normals, _, scans = rescanned_room()
+    assert ((pnu.normals(points) * normals).sum(1) > 0).mean() < 0.1
+    assert ((pnu.normals(points, scans=scans) * normals).sum(1) > 0).mean() > 0.98
+    settled = settled_normals(points, None, scans=scans)
+    assert settled.side == "towards the scanners of 2 scans, found by their points"
+    with pytest.raises(ValueError, match=r"scans: expected a number for each of \d+ points, found shape \(3,\)"):
+        pnu.normals(points, scans=[1, 2, 3])
+
+
+def test_sensors_that_cannot_have_seen_the_points_are_not_believed() -> None:
+    """As files name them that put all scans at one place, or the origin of a map for a scanner."""
+    points, normals, true, scans = rescanned_room()
+    for wrong in (true + [30, 0, 0], np.broadcast_to([1000.0, 1000, 0], points.shape)):
+        settled = settled_normals(points, None, found=Sight("as the file says", viewpoint=wrong), scans=scans)
+        assert ((settled.normals * normals).sum(1) > 0).mean() > 0.98
+        assert "what the file says of the sensors of" in settled.words
+        assert "found by their points" in settled.side
+    half = np.where((scans == 0)[:, None], true, true + [30, 0, 0])
+    for viewpoint, doubt in ((true, False), (half, True)):
+        settled = settled_normals(points, None, found=Sight("as the file says", viewpoint=viewpoint))
+        assert ((settled.normals * normals).sum(1) > 0).mean() > 0.98
+        assert settled.side == "as the file says"
+        assert ("can't be" in settled.words) == doubt
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -72,10 +72,11 @@ def test_laz_in_one_piece_is_one_line(tmp_path: Path) -> None:
 
 
 def e57(path: Path, scans: list[dict[str, Array]], move: Array) -> None:
+    """move: of all scans (3,), or of each."""
     pye57 = pytest.importorskip("pye57")
     file = pye57.E57(str(path), mode="w")
-    for scan in scans:
-        file.write_scan_raw(scan, rotation=np.array([1.0, 0, 0, 0]), translation=move)
+    for scan, place in zip(scans, np.broadcast_to(move, (len(scans), 3)), strict=True):
+        file.write_scan_raw(scan, rotation=np.array([1.0, 0, 0, 0]), translation=place)
     file.close()
 
 
@@ -100,6 +101,27 @@ def test_e57(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"d\.e57: is no e57 file that can be read \(.*\); export it again") as error:
         read_cloud(tmp_path / "d.e57")
     assert "\n" not in str(error.value)
+
+
+def test_e57_says_where_each_scan_stood(tmp_path: Path) -> None:
+    points = sphere()
+    scans = [scan(points[:40], None), scan(points[40:], None)]
+    stood = np.array([[1.0, 2, 3], [-4, 5, 6]])
+    for places, expected in ((stood, stood), (stood * [[1], [0]], [stood[0], np.full(3, np.nan)])):
+        e57(tmp_path / "c.e57", scans, places)
+        found = read_cloud(tmp_path / "c.e57").attributes
+        np.testing.assert_array_equal(found["scan"], np.repeat([0, 1], [40, 20]))
+        sensors = np.stack([found[f"sensor_{axis}"] for axis in "xyz"], 1)
+        np.testing.assert_array_equal(sensors, np.repeat(expected, [40, 20], axis=0))
+
+
+def test_e57_of_scans_whose_places_it_does_not_say(tmp_path: Path) -> None:
+    """0 0 0, where files put what was joined elsewhere."""
+    points = sphere()
+    e57(tmp_path / "c.e57", [scan(points[:40], None), scan(points[40:], None)], np.zeros(3))
+    assert read_cloud(tmp_path / "c.e57").attributes.keys() == {"intensity", "scan"}
+    e57(tmp_path / "d.e57", [scan(points, None)], np.zeros(3))
+    assert read_cloud(tmp_path / "d.e57").attributes.keys() == {"intensity"}
 
 
 def test_e57_without_its_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -183,8 +183,20 @@ def test_ptx(tmp_path: Path) -> None:
     cloud = read(tmp_path, "c.ptx", scan(XYZ[:10], "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n") + scan(second, turned))
     x, y, z = XYZ[10:].T
     np.testing.assert_allclose(cloud.points, np.vstack([XYZ[:10], np.stack([10 - y, 20 + x, 30 + z], 1)]))
-    assert cloud.attributes.keys() == {"intensity", "colors"}
+    assert cloud.attributes.keys() == {"intensity", "colors", "scan", "sensor_x", "sensor_y", "sensor_z"}
+    np.testing.assert_array_equal(cloud.attributes["scan"], np.repeat([0, 1], [10, N - 10]))
+    sensors = np.stack([cloud.attributes[f"sensor_{axis}"] for axis in "xyz"], 1)
+    np.testing.assert_array_equal(sensors, np.repeat([[np.nan] * 3, [10.0, 20, 30]], [10, N - 10], axis=0))
     assert cloud.notes == (f"2 of {N + 2} points left out: no return", "2 scans, each moved to its place")
+
+
+def test_ptx_of_points_that_lie_where_they_belong(tmp_path: Path) -> None:
+    """No matrix moves them; the scanner's place is in the first of its lines."""
+    head = f"{N}\n1\n4 5 6\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
+    cloud = read(tmp_path, "c.ptx", head + lines(XYZ, np.full((N, 1), 0.5)))
+    np.testing.assert_allclose(cloud.points, XYZ)
+    assert cloud.attributes.keys() == {"intensity", "sensor_x", "sensor_y", "sensor_z"}
+    assert [set(cloud.attributes[f"sensor_{axis}"]) for axis in "xyz"] == [{4}, {5}, {6}]
 
 
 STRUCTURED = np.zeros((4, 6), [("xyz", "<f8", 3), ("Normal", "<f4", 3), ("rgb", "u1", 3), ("label", "<i4")])
