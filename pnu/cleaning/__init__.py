@@ -13,7 +13,8 @@ from pnu.geometry.single_view import camera_place
 from pnu.geometry.spacing import spacing
 from pnu.io import Cloud
 from pnu.io.cloud import chosen
-from pnu.io.sensor import Sight, scan_numbers
+from pnu.io.scan_columns import scan_numbers
+from pnu.io.sensor import Sight
 
 Treatment = Literal["auto", "keep"]
 TREATMENTS = ("auto", "keep")

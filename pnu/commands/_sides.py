@@ -15,7 +15,10 @@ NORMALS = (
     "auto: the file's, turned over where they contradict each other, estimated where missing; orient: the file's axes, "
     "all sides chosen; estimate: all estimated; keep: the file's as they are"
 )
-VIEWPOINT = "x,y,z, place of the sensor: normals look to where they were seen from; null: where the file says so"
+VIEWPOINT = (
+    "x,y,z, place of the sensor, or a file of its places, with times or without, as a scanner's way: normals look to "
+    "where they were seen from; null: where the file says so"
+)
 UP = "x, y, z, -x, -y or -z: the direction from which all was seen, as from the air; null: of airborne scans"
 SIDE = "out or in: of closed shapes, in for rooms and tunnels; of open ones in is the other side; null: out"
 
@@ -35,7 +38,8 @@ def sided(cfg: Any, cloud: "Cloud", *, learned: bool = True, places: "Sight | No
     """A normal for each point of a cloud, as the keys and the file say. Without `learned` those that are estimated are
     plane fits. places: what those of the points say, where that is known already."""
     from pnu.geometry.cloud_normals import settled_normals
-    from pnu.io.sensor import asked_sight, scan_numbers, sight_of
+    from pnu.io.scan_columns import scan_numbers
+    from pnu.io.sensor import asked_sight, sight_of
     from pnu.upsamplers.learned_normals import learned_normals
 
     with stages(cfg.quiet) as progress:
@@ -43,7 +47,7 @@ def sided(cfg: Any, cloud: "Cloud", *, learned: bool = True, places: "Sight | No
             cloud.points,
             cloud.normals,
             choice=cfg.normals,
-            asked=asked_sight(cfg.viewpoint, cfg.up, cfg.side),
+            asked=asked_sight(cfg.viewpoint, cfg.up, cfg.side, cloud.attributes),
             found=sight_of(cfg.input, cloud.attributes) or places,
             scans=scan_numbers(cloud.attributes),
             refine=learned_normals if learned else None,

@@ -25,6 +25,7 @@ GROUND = "up, as ground and what stands on it"
 UP = np.array([0.0, 0.0, 1.0])
 LEVEL = 0.7  # height of the mean normal of what is mostly ground
 TELLING, MISSED = 1000, 0.15  # points of a sensor that tell whether it saw them, and their share that it may not have
+FAR = 100.0  # extents of a cloud from it to where it was seen from
 AGAINST = 0.2  # as much may Gauss' law speak for the other side: things on a ground are open below
 
 
@@ -92,6 +93,9 @@ def settled_normals(
         places = sight.viewpoint[order] if of_each else sight.viewpoint
         pixels = sight.pixels or (not of_each and is_camera(sight.viewpoint, points))
         sight = sight._replace(viewpoint=(places - frame.center[0]) / frame.scale.item(), pixels=pixels)
+    if sight is not None and sight.places is not None:
+        check_one_frame(sight.places, points)
+        sight = sight._replace(places=(sight.places - frame.center[0]) / frame.scale.item())
     sign, side = _signs(unit, lines, known, anew, sight, repair=bool(why))
     progress("normals", 1, 1)
     sign = np.where(anew, sign, 1)
@@ -105,6 +109,18 @@ def check_not_a_line(points: np.ndarray) -> None:
     extent = np.linalg.svd(points - points.mean(0), compute_uv=False)
     if extent[1] < 1e-9 * extent[0]:
         raise ValueError(f"points: all {len(points)} points lie on a line; expected points on a surface")
+
+
+def check_one_frame(places: np.ndarray, points: np.ndarray) -> None:
+    """`ValueError` where places (k, 3) of sensors are so far from all points (n, 3) that they are of another frame."""
+    low, high = points.min(0), points.max(0)
+    off = np.linalg.norm(np.maximum(np.maximum(low - places, places - high), 0), axis=1).min()
+    extent = np.linalg.norm(high - low)
+    if off > FAR * extent:
+        raise ValueError(
+            f"viewpoint: its places lie {off:.3g} and more from the points, which reach over {extent:.3g}; expected "
+            "places in the frame and the unit of the cloud"
+        )
 
 
 def contradiction(points: np.ndarray, normals: np.ndarray) -> str:
@@ -201,7 +217,8 @@ def _signs(
     """A sign for each line, and what decided those that are anew."""
     same = np.ones(len(known))
     if sight is not None and sight.inward is None:
-        return seen_signs(unit, lines, viewpoint=sight.viewpoint, up=sight.up, surely=sight.pixels), sight.words
+        told = {"viewpoint": sight.viewpoint, "up": sight.up, "places": sight.places}
+        return seen_signs(unit, lines, **told, surely=sight.pixels), sight.words
     if sight is None and known.any() and not anew[known].any():
         return same, "as the nearest given"
     if sight is None and repair:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pnu.geometry.connected_parts import connected_parts
+from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.orientation import SOME_NOISE, NeighborCloud, field, gauss_law, signs
 from pnu.geometry.point_tree import PointTree
 
@@ -38,6 +39,7 @@ COVERED = 1.5  # spacings around a point that hide what is behind
 ALONG, ALIKE = 0.5, 0.5  # pairs whose signs can contradict: sine with the tangent planes, cosine of the axes
 SURE = 2.0  # how sharply the field decides
 ROUNDS = 30
+LOOKED_FROM, LOOKED_AT = 48, 50_000  # of many places, and at points
 MOST = 2 / 3  # of the given signs that decide the side of a closed shape too
 
 
@@ -69,14 +71,18 @@ def seen_signs(
     *,
     viewpoint: np.ndarray | None = None,
     up: np.ndarray | None = None,
+    places: np.ndarray | None = None,
     surely: bool = False,
 ) -> np.ndarray:
     """+1 or -1 for each unit line (n, 3) at points (n, 3): the side that was seen, (n,).
 
     viewpoint: place of the sensor, (3,), or of each point's own, (n, 3), NaN where it is not known. up: (3,), the
-    direction from which all was seen, as from the air. surely: no point hides another from the sensor. In a part of the
-    cloud of which nothing is known, lines keep the side of most of their neighbors.
+    direction from which all was seen, as from the air. places: (k, 3), some of which saw each point. surely: no point
+    hides another from the sensor. In a part of the cloud of which nothing is known, lines keep the side of most of
+    their neighbors.
     """
+    if places is not None:
+        return voted_signs(points, lines, seen_from_some(points, lines, places))
     way = np.broadcast_to(np.asarray(up, np.float64), points.shape) if viewpoint is None else viewpoint - points
     with np.errstate(invalid="ignore"):
         way = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-300)
@@ -84,6 +90,35 @@ def seen_signs(
     if viewpoint is not None and np.ndim(viewpoint) == 1 and not surely:
         seen[hidden(points, lines, np.asarray(viewpoint, np.float64))] = 0
     return voted_signs(points, lines, seen, surely=surely or viewpoint is None)
+
+
+def seen_from_some(points: np.ndarray, lines: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """On which side, and how clearly, lines (n, 3) at points (n, 3) are seen from places (k, 3), -1 to 1, (n,).
+
+    What sees a point counts the more the nearer it is; 0 where nothing does. Of many places an even part is looked
+    from, and at a part of many points: the others have 0.
+    """
+    low, high = points.min(0), points.max(0)
+    off = np.linalg.norm(np.maximum(np.maximum(low - places, places - high), 0), axis=1)
+    near = places[off <= max(float(np.linalg.norm(high - low)), float(off.min()))]
+    near = np.unique(near, axis=0)
+    if len(near) > LOOKED_FROM:
+        near = near[farthest_points_large(near, LOOKED_FROM)]
+    rows = np.arange(len(points))
+    if len(rows) > LOOKED_AT:
+        rows = np.sort(np.random.default_rng(0).permutation(rows)[:LOOKED_AT])
+    some, axes = points[rows], lines[rows]
+    spacing = PointTree(some).among_themselves(min(6, len(some)))[0].mean(1)
+    heard, weights = np.zeros(len(rows)), np.zeros(len(rows))
+    for place in near:
+        way = place - some
+        distance = np.maximum(np.linalg.norm(way, axis=1), 1e-300)
+        weight = np.where(hidden(some, axes, place, spacing), 0, 1 / distance**2)
+        heard += weight * (axes * way).sum(1) / distance
+        weights += weight
+    seen = np.zeros(len(points))
+    seen[rows] = heard / np.maximum(weights, 1e-300)
+    return seen
 
 
 def voted_signs(points: np.ndarray, lines: np.ndarray, seen: np.ndarray, *, surely: bool = False) -> np.ndarray:

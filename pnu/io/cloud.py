@@ -52,7 +52,7 @@ def read_cloud(
 
     columns: of text and of arrays without names, such as "x,y,z,_,r,g,b" (_ is left out); None: by the names in the
     file, or by the usual order: x y z, then unit normals, colors and scalars where they stand.
-    pulses: of las also what belongs to the pulse and not to the place: number of returns, scan angle, source ...
+    pulses: of las also what belongs to the pulse and not to the place: number of returns, scan angle ...
     Of a mesh the vertices are taken. Coordinates stay float64.
 
     Raises `ValueError` (one line: file, what was expected, what was found, what to do) for a missing, empty, damaged

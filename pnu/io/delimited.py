@@ -10,7 +10,7 @@ import numpy as np
 
 from pnu.io.columns import SKIP
 from pnu.io.fields import DEGREES, POINTS
-from pnu.io.sensor import columns_of_scans
+from pnu.io.scan_columns import columns_of_scans
 from pnu.io.text import table, text_lines
 
 SAMPLE = 100  # lines that tell how a file is written

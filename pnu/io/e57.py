@@ -9,7 +9,7 @@ import numpy as np
 
 from pnu.extras import require
 from pnu.io import e57_child
-from pnu.io.sensor import columns_of_scans
+from pnu.io.scan_columns import columns_of_scans
 
 SECONDS = 600
 NAMES = {

@@ -21,10 +21,10 @@ SLICE = 2**20  # points
 SLICE_BYTES = 2**28  # at most, whatever size of a point a header claims
 MOST = 100  # points that a byte of laz may hold: bounds what a damaged header makes us allocate
 NORMAL = ("nx", "ny", "nz")  # extra dimensions
-CARRIED = ("intensity", "classification", "gps_time")
+CARRIED = ("intensity", "classification", "gps_time", "point_source_id")
 PULSES = (  # of the pulse that a point is from, or of how the file was made: no sense between points
     *("return_number", "number_of_returns", "scan_angle", "scan_angle_rank", "scan_direction_flag", "user_data"),
-    *("edge_of_flight_line", "point_source_id", "scanner_channel", "synthetic", "key_point", "withheld", "overlap"),
+    *("edge_of_flight_line", "scanner_channel", "synthetic", "key_point", "withheld", "overlap"),
 )
 OBLIQUE = 75  # degrees from straight down: more than scanners look sideways from the air
 RANK = 0.006  # degrees in a step of scan_angle; those of scan_angle_rank, in older formats, are whole ones
@@ -44,9 +44,9 @@ def _laspy(path: Path) -> ModuleType:
 
 
 def read_las(path: Path, pulses: bool = False) -> Content:
-    """Points (n, 3) float64, normals if there are, colors, intensity, class, time and extra scalars, notes.
+    """Points (n, 3) float64, normals if there are, colors, intensity, class, time, source and extra scalars, notes.
 
-    pulses: also what belongs to the pulse: number of returns, scan angle, source ...
+    pulses: also what belongs to the pulse: number of returns, scan angle ...
     """
     laspy = _laspy(path)
     try:

@@ -1,30 +1,32 @@
 """Where a cloud was seen from, as far as its file says so."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from pnu.io.cloud import CLOUD_SUFFIXES
 from pnu.io.fields import matching
 from pnu.io.las import is_from_the_air
 from pnu.io.pcd import read_viewpoint
+from pnu.io.trajectory import read_trajectory, times_of
 
 PLACES = tuple(
     tuple(f"{name}{axis}" for axis in "xyz")
     for name in ("sensor_", "vp_", "viewpoint_", "scanner_", "sensor_origin_", "camera_", "sensor", "vp")
 )
-SCANS = frozenset({"scan", "scanid", "scanindex", "scannumber", "pointsourceid", "station", "stationid"})
 AXES = {f"{minus}{'xyz'[axis]}": (-1) ** len(minus) * np.eye(3)[axis] for minus in ("", "-") for axis in range(3)}
 
 
 class Sight(NamedTuple):
-    """What says which side of a surface was seen: one of three, and in words where it is from."""
+    """What says which side of a surface was seen: one of four, and in words where it is from."""
 
     words: str
     viewpoint: np.ndarray | None = None  # place of the sensor, (3,), or of each point's own, (n, 3), NaN: not known
     up: np.ndarray | None = None  # (3,) direction from which all was seen
     inward: bool | None = None  # the side of closed shapes: true for rooms and tunnels
+    places: np.ndarray | None = None  # (k, 3), of sensors: each point was seen from one of these, not known which
     pixels: bool = False  # that of a camera whose pixels the points are, so that it saw all of them
 
 
@@ -45,35 +47,14 @@ def sight_of(path: str | Path, attributes: Mapping[str, np.ndarray]) -> Sight | 
     return None
 
 
-def columns_of_scans(
-    sizes: Sequence[int] | np.ndarray, places: Sequence[np.ndarray] | np.ndarray
-) -> dict[str, np.ndarray]:
-    """Of points (n,) that come scan by scan: "scan", its number, and "sensor_x" ..., where it stood, NaN if at 0 0 0.
-
-    That is where files put scans of which they do not know it. A single scan has no number; without places, none.
-    """
-    columns: dict[str, np.ndarray] = {}
-    if len(sizes) > 1:
-        columns["scan"] = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)
-    told = np.where(np.any(places, axis=1, keepdims=True), places, np.nan)
-    if not np.isnan(told).all():
-        columns |= {name: np.repeat(column, sizes) for name, column in zip(PLACES[0], told.T, strict=True)}
-    return columns
-
-
-def scan_numbers(attributes: Mapping[str, np.ndarray]) -> np.ndarray | None:
-    """Which scan each point is of, (n,), where columns say so and there are several."""
-    for name, values in attributes.items():
-        if name.lower().removeprefix("scalar_").replace("_", "") in SCANS and values.ndim == 1:
-            different, number = np.unique(values, return_inverse=True)
-            return np.asarray(number) if len(different) > 1 else None
-    return None
-
-
-def asked_sight(viewpoint: Any = None, up: Any = None, side: str | None = None) -> Sight | None:
+def asked_sight(
+    viewpoint: Any = None, up: Any = None, side: str | None = None, attributes: Mapping[str, np.ndarray] | None = None
+) -> Sight | None:
     """What shall decide the side of normals, as keys and arguments of these names say it; None: nothing is asked.
 
-    viewpoint: three numbers, their text, or an array (n, 3); up: "z", "-z", "x" ..., or three numbers; side: in or out.
+    viewpoint: three numbers, their text, an array (n, 3), or the file of a `Trajectory`, along which times among the
+    attributes of a cloud tell the place of each point's sensor; up: "z", "-z", "x" ..., or three numbers; side: in or
+    out.
     `ValueError`, one line, where they are something else, or two answers to one question.
     """
     asked = {"viewpoint": viewpoint, "up": up, "side": side}
@@ -82,8 +63,12 @@ def asked_sight(viewpoint: Any = None, up: Any = None, side: str | None = None) 
         raise ValueError(f"{names[0]}= and {names[1]}=: both decide the side of normals; give one of them")
     if viewpoint is not None:
         places = _numbers(viewpoint)
+        if places is None and isinstance(viewpoint, str) and _is_file(viewpoint):
+            return _sight_along(viewpoint, attributes or {})
         if places is None or places.shape[-1:] != (3,) or places.ndim > 2 or np.isinf(places).any():
-            raise ValueError(f"viewpoint={_short(viewpoint)}: expected the place of the sensor, viewpoint=x,y,z")
+            raise ValueError(
+                f"viewpoint={_short(viewpoint)}: expected the place of the sensor, viewpoint=x,y,z, or a file of places"
+            )
         if np.isnan(places).all(-1).all() or (places.ndim == 1 and np.isnan(places).any()):
             raise ValueError(f"viewpoint={_short(viewpoint)}: expected three numbers, found NaN")
         return Sight("towards the sensor" + (f" at {spelled_place(places)}" if places.ndim == 1 else "s"), places)
@@ -97,6 +82,19 @@ def asked_sight(viewpoint: Any = None, up: Any = None, side: str | None = None) 
             raise ValueError(f"side={_short(side)}: expected out or in, the side of closed shapes to look to")
         return Sight(f"{side}ward, side={side}", inward=side == "in")
     return None
+
+
+def _is_file(name: str) -> bool:
+    return Path(name).is_file() or Path(name).suffix.lower() in CLOUD_SUFFIXES
+
+
+def _sight_along(path: str, attributes: Mapping[str, np.ndarray]) -> Sight:
+    """From a sensor's way, at the times of the points where these are known, else from any of its places."""
+    way, times = read_trajectory(path), times_of(dict(attributes))
+    of_each = None if times is None else way.at(times)
+    if of_each is not None:
+        return Sight(f"towards the sensor, which was where {path} says it was at the time", viewpoint=of_each)
+    return Sight(f"towards the {len(way.places)} places of {path} that see the points", places=way.places)
 
 
 def _numbers(values: Any) -> np.ndarray | None:

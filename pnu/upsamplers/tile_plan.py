@@ -34,7 +34,8 @@ from pnu.io import atomic_path, read_json, write_json
 from pnu.io.cloud import ORIGIN, UNSEEN, Cloud, first_of_each_place, looks_geographic, unit_normals
 from pnu.io.fields import GEOGRAPHIC, as_colors
 from pnu.io.point_stream import in_range, is_geographic, point_slices
-from pnu.io.sensor import Sight, asked_sight, scan_numbers, sight_of
+from pnu.io.scan_columns import scan_numbers
+from pnu.io.sensor import Sight, asked_sight, sight_of
 from pnu.runtime.progress import Progress, silent
 from pnu.upsamplers.surface_projection import is_even, noise_in_spacings
 
@@ -137,7 +138,7 @@ class Plan:
 
     def sight(self, attributes: Mapping[str, np.ndarray]) -> Sight | None:
         """What says which side of the surface was seen; None: nothing does, or given normals are to stay."""
-        asked = asked_sight(self.keys.viewpoint, self.keys.up, self.keys.side)
+        asked = asked_sight(self.keys.viewpoint, self.keys.up, self.keys.side, attributes)
         above = Sight("up, as a map of heights", up=np.array([0.0, 0, 1])) if self.facts.heights else None
         return asked or sight_of(self.keys.input, attributes) or above
 
@@ -432,6 +433,7 @@ def _coarse_cloud(folder: Path, keys: Keys, facts: Facts, full: list[int]) -> No
             if found is not None and scans is not None and found.viewpoint is not None:
                 found = found._replace(viewpoint=found.viewpoint[kept])
         rows = rows[kept]
+    asked = asked_sight(keys.viewpoint, keys.up, keys.side, attributes_of(rows))
     settled = settled_normals(
         rows["point"], rows["normal"] if facts.given else None,
         choice=keys.normals if keys.normals != "auto" or not facts.turned else "orient",  # type: ignore[arg-type]

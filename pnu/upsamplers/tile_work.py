@@ -155,7 +155,8 @@ def _normals(plan: Plan, rows: NDArray[Any]) -> NDArray[np.float64]:
         if place is not None:
             place = (place - frame.center) / frame.scale
             place = place[0] if sight.viewpoint is not None and sight.viewpoint.ndim == 1 else place
-        sign = seen_signs(unit, lines, viewpoint=place, up=sight.up)
+        places = None if sight.places is None else (sight.places - frame.center) / frame.scale
+        sign = seen_signs(unit, lines, viewpoint=place, up=sight.up, places=places)
     else:
         sign = voted_signs(unit, lines, _votes(plan, rows["point"], lines))
     return lines * np.where(anew, sign, 1.0)[:, None]

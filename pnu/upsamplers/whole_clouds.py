@@ -350,7 +350,7 @@ def normals(
     points: CloudT,
     normals: np.ndarray | Tensor | None = None,
     *,
-    viewpoint: np.ndarray | Sequence[float] | None = None,
+    viewpoint: np.ndarray | Sequence[float] | str | None = None,
     up: str | np.ndarray | Sequence[float] | None = None,
     side: Literal["out", "in"] | None = None,
     scans: np.ndarray | Sequence[int] | None = None,
@@ -364,7 +364,7 @@ def normals(
     points: np.ndarray | Sequence[Sequence[float]],
     normals: np.ndarray | Tensor | None = None,
     *,
-    viewpoint: np.ndarray | Sequence[float] | None = None,
+    viewpoint: np.ndarray | Sequence[float] | str | None = None,
     up: str | np.ndarray | Sequence[float] | None = None,
     side: Literal["out", "in"] | None = None,
     scans: np.ndarray | Sequence[int] | None = None,
@@ -377,7 +377,7 @@ def normals(
     points: Any,
     normals: np.ndarray | Tensor | None = None,
     *,
-    viewpoint: np.ndarray | Sequence[float] | None = None,
+    viewpoint: np.ndarray | Sequence[float] | str | None = None,
     up: str | np.ndarray | Sequence[float] | None = None,
     side: Literal["out", "in"] | None = None,
     scans: np.ndarray | Sequence[int] | None = None,
@@ -394,8 +394,8 @@ def normals(
         points: (n, 3), n >= 16, in any unit and anywhere: an array, a tensor on any device, or a cloud of another
             library as `upsample` takes it.
         normals: (n, 3), of any length; estimated where zero or NaN.
-        viewpoint: place of the sensor, (3,), or of the sensor of each point, (n, 3), NaN where it is not known: normals
-            look to where they were seen from.
+        viewpoint: place of the sensor, (3,), or of the sensor of each point, (n, 3), NaN where it is not known, or
+            a file of its places, of which some saw each point: normals look to where they were seen from.
         up: the direction from which all was seen, as from the air: "z", "-z", "x" ..., or three numbers.
         side: "out" or "in", of closed shapes, such as rooms and tunnels; on open ones "in" is the other side.
         scans: (n,) numbers, which scan each point is of: the scanner of each is looked for by itself.

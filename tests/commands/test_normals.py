@@ -220,6 +220,7 @@ BAD = {
     "viewpoint=1,2": "viewpoint=1,2: expected the place of the sensor, viewpoint=x,y,z",
     "viewpoint=5": "viewpoint=5: expected the place of the sensor, viewpoint=x,y,z",
     "viewpoint=a,b,c": "viewpoint=a,b,c: expected the place of the sensor, viewpoint=x,y,z",
+    "viewpoint=no.txt": "no.txt: no such file",
     "viewpoint=nan,0,0": "viewpoint=nan,0,0: expected three numbers, found NaN",
     "up=w": "up=w: expected x, y, z, -x, -y or -z, the axis that points up",
     "side=left": "side=left: expected out or in, the side of closed shapes to look to",
@@ -358,3 +359,21 @@ def test_two_scans_of_a_room_look_into_it(tmp_path: Path, told: int, side: str) 
     assert found.normals is not None
     assert ((found.normals * true).sum(1) > 0).mean() > 0.98
     assert set(found.attributes["scan"]) == {0, 1}
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_the_way_of_a_scanner(tmp_path: Path, timed: bool) -> None:
+    """A room in one cloud, and a file that says where the scanner was, when or not."""
+    points, true, places, scans = rescanned_room()
+    write_cloud(tmp_path / "room.ply", points, None, {"gps_time": 100.0 + 50 * scans + np.linspace(0, 40, len(scans))})
+    stood = np.unique(places, axis=0)[[0, 0, 1, 1]]
+    times = 100.0 + np.array([[0], [45], [60], [100]])
+    way = np.hstack([times, stood]) if timed else stood
+    (tmp_path / "way.txt").write_text("\n".join(" ".join(map(str, row)) for row in way))
+    done = ran(main, tmp_path, "input=room.ply", "output=out.ply", "viewpoint=way.txt")
+    assert done.returncode == 0, done.stderr
+    words = "the sensor, which was where way.txt says it was at the time" if timed else "the 4 places of way.txt that"
+    assert f"side: towards {words}" in done.stdout
+    found = read_cloud(tmp_path / "out.ply").normals
+    assert found is not None
+    assert ((found * true).sum(1) > 0).mean() > 0.98

@@ -197,7 +197,10 @@ def test_from_python() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"viewpoint": [1, 2]}, r"^viewpoint=\[1, 2\]: expected the place of the sensor, viewpoint=x,y,z$"),
+        (
+            {"viewpoint": [1, 2]},
+            r"^viewpoint=\[1, 2\]: expected the place of the sensor, viewpoint=x,y,z, or a file of places$",
+        ),
         ({"viewpoint": [1, 2, np.nan]}, "^viewpoint=.*: expected three numbers, found NaN$"),
         ({"viewpoint": np.ones((5, 3))}, r"^viewpoint: expected \(3,\) or \(100, 3\), found shape \(5, 3\)$"),
         ({"viewpoint": "here"}, "^viewpoint=here: expected the place of the sensor"),

@@ -71,6 +71,22 @@ def test_of_several_scanners_each_is_found_where_the_scans_are_told_apart() -> N
         pnu.normals(points, scans=[1, 2, 3])
 
 
+@pytest.mark.parametrize("more", [0, 200])
+def test_of_several_places_what_sees_a_point_decides(more: int) -> None:
+    """The way of a scanner, of which it is not known where it saw what."""
+    points, normals, places, _ = rescanned_room()
+    way = np.unique(places, axis=0)
+    way = way[0] + np.linspace(0, 1, 2 + more)[:, None] * (way[1] - way[0])
+    settled = settled_normals(points, None, asked=Sight("on its way", places=way))
+    assert ((settled.normals * normals).sum(1) > 0).mean() > 0.98
+    assert settled.side == "on its way"
+    order = np.random.default_rng(0).permutation(len(points))
+    again = settled_normals(points[order], None, asked=Sight("on its way", places=way[::-1]))
+    np.testing.assert_allclose(again.normals, settled.normals[order], atol=1e-9)
+    with pytest.raises(ValueError, match="viewpoint: its places lie .* expected places in the frame and the unit of"):
+        settled_normals(points, None, asked=Sight("on its way", places=way + [447321.0, 5411934, 313]))
+
+
 def test_sensors_that_cannot_have_seen_the_points_are_not_believed() -> None:
     """As files name them that put all scans at one place, or the origin of a map for a scanner."""
     points, normals, true, scans = rescanned_room()

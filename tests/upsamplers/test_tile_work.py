@@ -104,6 +104,9 @@ def test_sides_agree_between_tiles(tmp_path: Path) -> None:
     assert ((dense[:, :3] * dense[:, 3:]).sum(1) < 0).all()
     dense = make(plan_of(tmp_path / "seen", 3 * ball(400) + 7, 220, ratio=1.5, viewpoint="7,7,7"))
     assert (((dense[:, :3] - 7) * dense[:, 3:]).sum(1) < 0).all()
+    (tmp_path / "way.xyz").write_text("7 7 7\n7.5 7 7\n")
+    dense = make(plan_of(tmp_path / "way", 3 * ball(400) + 7, 220, ratio=1.5, viewpoint=str(tmp_path / "way.xyz")))
+    assert (((dense[:, :3] - 7) * dense[:, 3:]).sum(1) < 0).all()
     for up, sign in (("z", 1), ("-z", -1)):
         dense = make(plan_of(tmp_path / up, sheet(200), 110, ratio=1.5, up=up))
         assert (sign * dense[:, 5] > 0).all()
