@@ -43,6 +43,19 @@ def gather_block(cloud: Floats, query: Floats, idx: Ints, start: int, near: Buff
 
 
 @kernel(inner=True)
+def gather_messages(cloud: Floats, idx: Ints, start: int, features: Buffer) -> None:
+    """What a cloud (n, 6 + c) has beside points and normals, of the neighbors idx (m, k) of queries from `start` on:
+    into the rows of `features` that follow FEATURES."""
+    k = idx.shape[1]
+    rows = len(features) // (k * LANES)
+    for lane in range(LANES):
+        q = min(start + lane, len(idx) - 1)
+        for i in range(k):
+            for c in range(min(rows - FEATURES, cloud.shape[1] - 6)):
+                features[(i * rows + FEATURES + c) * LANES + lane] = f32(cloud[idx[q, i], 6 + c])
+
+
+@kernel(inner=True)
 def _row(buffer: Buffer, i: int) -> Any:
     return load_vector(buffer, i * LANES)
 
@@ -163,9 +176,10 @@ def _half_turn(difference: Any, twice: Any) -> Any:
 def make_frames(
     near: Buffer, hint: Buffer, k: int, sphere: bool, work: Buffer, frame: Buffer, features: Buffer
 ) -> None:
-    """Neighbors `near` (k x NEAR rows) and rough normals `hint` (3 rows) -> `frame` (FRAME rows), `features` (k x
-    FEATURES rows); `work` (k x WORK rows) is for what lies between. See `local_frames`."""
+    """Neighbors `near` (k x NEAR rows) and rough normals `hint` (3 rows) -> `frame` (FRAME rows), `features` (the first
+    FEATURES of its rows for each neighbor); `work` (k x WORK rows) is for what lies between. See `local_frames`."""
     zero, one = full(f32(0)), full(f32(1))
+    rows = len(features) // (k * LANES)
     spacing = _surroundings(near, hint, k, work)
     per_spacing = one / spacing
     if sphere:
@@ -189,8 +203,8 @@ def make_frames(
         _put(work, i * WORK + TURN + 1, turn_v)
         _put(work, i * WORK + PLACE, place_u)
         _put(work, i * WORK + PLACE + 1, place_v)
-        _put(features, i * FEATURES + 2, _dot(x, y, z, zx, zy, zz))
-        _put(features, i * FEATURES + 5, _dot(a, b, c, zx, zy, zz))
+        _put(features, i * rows + 2, _dot(x, y, z, zx, zy, zz))
+        _put(features, i * rows + 5, _dot(a, b, c, zx, zy, zz))
         flat = full(FLAT) * w
         uu = fused(w * turn_u, turn_u, fused(flat * place_u, place_u, uu))
         uv = fused(w * turn_u, turn_v, fused(flat * place_u, place_v, uv))
@@ -209,15 +223,15 @@ def make_frames(
         place_u, place_v = _row(work, i * WORK + PLACE), _row(work, i * WORK + PLACE + 1)
         x, y = x_cos * place_u + x_sin * place_v, y_cos * place_v - y_sin * place_u
         a, b = x_cos * turn_u + x_sin * turn_v, y_cos * turn_v - y_sin * turn_u
-        z, c = _row(features, i * FEATURES + 2), _row(features, i * FEATURES + 5)
+        z, c = _row(features, i * rows + 2), _row(features, i * rows + 5)
         height = _dot(x, y, z, a, b, c)
-        _put_triple(features, i * FEATURES, x, y, z)
-        _put_triple(features, i * FEATURES + 3, a, b, c)
-        _put(features, i * FEATURES + 6, root(_dot(x, y, z, x, y, z)))
-        _put(features, i * FEATURES + 7, full(f32(0.5)) * (height + z))
-        _put(features, i * FEATURES + 8, height)
-        _put(features, i * FEATURES + 9, _row(work, i * WORK + SEEN))
-        _put(features, i * FEATURES + 10, _row(work, i * WORK + WEIGHT) * full(f32(k)))
+        _put_triple(features, i * rows, x, y, z)
+        _put_triple(features, i * rows + 3, a, b, c)
+        _put(features, i * rows + 6, root(_dot(x, y, z, x, y, z)))
+        _put(features, i * rows + 7, full(f32(0.5)) * (height + z))
+        _put(features, i * rows + 8, height)
+        _put(features, i * rows + 9, _row(work, i * WORK + SEEN))
+        _put(features, i * rows + 10, _row(work, i * WORK + WEIGHT) * full(f32(k)))
     _put_triple(frame, X_AXIS, x_cos * ux + x_sin * vx, x_cos * uy + x_sin * vy, x_cos * uz + x_sin * vz)
     _put_triple(frame, Y_AXIS, y_cos * vx - y_sin * ux, y_cos * vy - y_sin * uy, y_cos * vz - y_sin * uz)
     _put(frame, HEIGHT, zero - _dot(sx, sy, sz, zx, zy, zz))

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from pnu.kernels.boxes import Floats, Ints
 from pnu.kernels.compilation import by_numba, kernel
 from pnu.kernels.frames import (
-    FEATURES,
     FRAME,
     HEIGHT,
     NEAR,
@@ -26,6 +25,7 @@ from pnu.kernels.frames import (
     Buffer,
     f32,
     gather_block,
+    gather_messages,
     make_frames,
 )
 from pnu.kernels.panels import LANES, NARROW, PANEL, VECTORS, pack, padded, panel_of
@@ -85,6 +85,7 @@ def packed(parameters: dict[str, NDArray[np.float32]], *, attention: bool) -> Pa
     """PackedWeights of a projector by the names of its state dict; without attention all neighbors count alike."""
     width = len(parameters["first.bias"])
     wide, panel = padded(width), panel_of(width)
+    columns, results = parameters["first.weight"].shape[1], -(-len(parameters["out.bias"]) // LANES) * LANES
 
     def blocks(matrix: NDArray[np.float32], rows: list[int], columns: int) -> NDArray[np.float32]:
         """Transposed, with blocks of `width` rows and `rows` places for each of them, filled up to `columns`."""
@@ -108,13 +109,13 @@ def packed(parameters: dict[str, NDArray[np.float32]], *, attention: bool) -> Pa
     scale = LOG2_E if attention else f32(0)
     of_features, choices = np.split(parameters["attention.weight"] * scale, [width])
     return PackedWeights(
-        pack(blocks(parameters["first.weight"], [FEATURES], wide), panel), bias("first.bias", wide),
+        pack(blocks(parameters["first.weight"], [columns], wide), panel), bias("first.bias", wide),
         pack(blocks(parameters["second.weight"], [wide], wide), panel), bias("second.bias", wide),
         pack(blocks(parameters["context.weight"], [wide, wide, 1], wide), panel), bias("context.bias", wide),
         pack(blocks(parameters["third.weight"], [wide], wide), panel), bias("third.bias", wide),
         pack(blocks(of_features, [wide], wide), panel), blocks(choices, [wide], 2).T.ravel().copy(),
         pack(of_head, panel), bias("head.0.bias", 2 * wide), pack(last, panel), bias("head.2.bias", wide),
-        pack(blocks(parameters["out.weight"], [wide], LANES), LANES), bias("out.bias", LANES),
+        pack(blocks(parameters["out.weight"], [wide], results), LANES), bias("out.bias", results),
     )  # fmt: skip
 
 
@@ -161,16 +162,16 @@ def _finish(
     query: Floats, at: int, lane: int, k: int, frame: Buffer, features: Buffer, shares: Buffer, out: Buffer,
     result: Floats,
 ) -> None:  # fmt: skip
-    """One query's step and normal from what the network gave, (OUT,) at its lane's row of `out`."""
-    half = len(shares) // 2
+    """One query's step, normal and messages from what the network gave, in its lane's row of `out`."""
+    half, rows = len(shares) // 2, len(features) // (k * LANES)
     bent = x = y = z = f32(0)
     for i in range(k):
-        feature = i * FEATURES * LANES + lane
+        feature = i * rows * LANES + lane
         bent += shares[half + i] * features[feature + BENT * LANES]
         x += shares[i] * features[feature + 3 * LANES]
         y += shares[i] * features[feature + 4 * LANES]
         z += shares[i] * features[feature + 5 * LANES]
-    row = lane * LANES
+    row = lane * (len(out) // LANES)
     step_x, step_y, step_z = out[row], out[row + 1], out[row + 2] + f32(0.5) * bent
     x, y, z = x + out[row + 3], y + out[row + 4], z + out[row + 5]
     spacing = frame[SPACING * LANES + lane]
@@ -187,6 +188,8 @@ def _finish(
     for c in range(3):
         result[at, 3 + c] /= length
     result[at, 6] = out[row + 6] + np.log(spacing)
+    for c in range(OUT, result.shape[1]):
+        result[at, c] = np.tanh(out[row + c])
 
 
 @kernel(
@@ -201,9 +204,10 @@ def project_queries(
     last: Buffer, last_bias: Buffer, out: Buffer, out_bias: Buffer,
     result: Floats,
 ) -> None:  # fmt: skip
-    """Queries (m, 6) and their neighbors idx (m, k) of a cloud (n, 6), by `PackedWeights` -> result (m, 7): points,
-    normals, and the logarithm of the expected error."""
-    k, wide = idx.shape[1], len(first_bias)
+    """Queries (m, 6) and their neighbors idx (m, k) of a cloud (n, 6 + c), by `PackedWeights` -> result (m, 7 + c):
+    points, normals, the logarithm of the expected error, and messages. A cloud without messages has zeros."""
+    k, wide, results = idx.shape[1], len(first_bias), len(out_bias)
+    columns = len(first) // wide
     panel = NARROW if wide <= NARROW else PANEL
     rows = (k + ROWS - 1) // ROWS * ROWS  # of a query
     scale = f32(0)
@@ -211,7 +215,7 @@ def project_queries(
         if weight != 0:
             scale = LOG2_E
     near, hint, work = np.empty(k * NEAR * LANES, f32), np.empty(3 * LANES, f32), np.empty(k * WORK * LANES, f32)
-    features, frame = np.empty(k * FEATURES * LANES, f32), np.empty(FRAME * LANES, f32)
+    features, frame = np.zeros(k * columns * LANES, f32), np.empty(FRAME * LANES, f32)
     below, middle = np.zeros(LANES * rows * wide, f32), np.empty(LANES * rows * wide, f32)
     above, logits = np.empty(LANES * rows * wide, f32), np.empty(LANES * rows * wide, f32)
     pooled_wide, seen_wide = 2 * wide + 1, 3 * wide
@@ -222,16 +226,17 @@ def project_queries(
     head_rows, last_rows, outs = (
         np.empty(LANES * 2 * wide, f32),
         np.empty(LANES * wide, f32),
-        np.empty(LANES * LANES, f32),
+        np.empty(LANES * results, f32),
     )
     for start in range(0, len(query), LANES):
         gather_block(cloud, query, idx, start, near, hint)
         make_frames(near, hint, k, sphere, work, frame, features)
+        gather_messages(cloud, idx, start, features)
         for i in range(k):
             for q in range(0, LANES, FEW_ROWS):
                 for p in range(0, wide, panel):
                     _first(
-                        panel, features, i * FEATURES * LANES + q, 1, LANES, first, p * FEATURES, FEATURES,
+                        panel, features, i * columns * LANES + q, 1, LANES, first, p * columns, columns,
                         first_bias, p, below, (q * rows + i) * wide + p, rows * wide,
                     )  # fmt: skip
         for p in range(0, wide, panel):
@@ -282,6 +287,7 @@ def project_queries(
                     last_bias, p, last_rows, q * wide + p, wide,
                 )  # fmt: skip
         for q in range(0, LANES, FEW_ROWS):
-            _out(last_rows, q * wide, wide, 1, out, 0, wide, out_bias, 0, outs, q * LANES, LANES)
+            for p in range(0, results, LANES):
+                _out(last_rows, q * wide, wide, 1, out, p * wide, wide, out_bias, p, outs, q * results + p, results)
         for lane in range(min(LANES, len(query) - start)):
             _finish(query, start + lane, lane, k, frame, features, chosen[lane], outs, result)

@@ -15,8 +15,8 @@ from pnu.geometry.neighbor_ranks import neighbor_ranks
 
 Floats = NDArray[np.float64]
 Project = Callable[[Floats, Floats, NDArray[np.int64]], Floats]
-"""project(queries (m, 6), cloud (n, 6), their neighbors idx (m, k)) -> (m, 7): points, unit normals, logarithm of the
-expected error."""
+"""project(queries (m, 6), cloud (n, 6 + messages), their neighbors idx (m, k)) -> (m, 7 + messages): points, unit
+normals, logarithm of the expected error, messages."""
 
 TARGET = "pnu.networks.surface.Surface"
 WIDTHS = {  # layers: rows and columns of their weights, in widths of the network and features more
@@ -27,7 +27,7 @@ OUT, PREFIX, COARSE = 7, "projector.", "coarse."
 NEAREST = 16  # points that a coarse network looks at
 SETTINGS = (
     "ratio", "neighbors", "reach", "seeds", "candidates", "shortlist", "relaxation", "refinements", "reject", "slide",
-    "passes", "sphere", "attention", "fine",
+    "passes", "sphere", "attention", "fine", "messages",
 )  # fmt: skip
 TRAINING = ("width", "rounds", "queries", "smoothing", "refining", "coarse")  # that nothing here depends on
 
@@ -57,6 +57,7 @@ class CompiledSurface:
     sphere: bool
     attention: bool
     fine: int
+    messages: int
 
     def __init__(
         self, settings: Mapping[str, Any], parameters: Mapping[str, NDArray[np.float32]],
@@ -89,10 +90,10 @@ def compiled_step(parameters: Mapping[str, NDArray[np.float32]], *, sphere: bool
     """The step of a projector with these parameters."""
     from pnu.kernels.projector import packed, project_queries
 
-    matrices = packed(dict(parameters), attention=attention)
+    matrices, results = packed(dict(parameters), attention=attention), len(parameters["out.bias"])
 
     def step(query: Floats, cloud: Floats, idx: NDArray[np.int64]) -> Floats:
-        result = np.empty((len(query), 7))
+        result = np.empty((len(query), results))
         project_queries(*contiguous(query, cloud, idx), sphere, *matrices, result)
         return result
 
@@ -120,9 +121,10 @@ def contiguous(query: Floats, cloud: Floats, idx: NDArray[np.int64]) -> tuple[Fl
 def is_known(parameters: Mapping[str, Any]) -> bool:
     """Whether parameters (arrays or tensors) are those of a projector as the kernels know it."""
     width = len(parameters.get("first.bias", ()))
+    messages = max(0, len(parameters.get("out.bias", ())) - OUT)
     shapes: dict[str, tuple[int, ...]] = {"attention.weight": (width + 2, width)}
     for layer, (rows, columns, more) in WIDTHS.items():
-        out = rows * width or OUT
+        out, more = rows * width or OUT + messages, more + messages * (layer == "first")
         shapes |= {f"{layer}.weight": (out, columns * width + more), f"{layer}.bias": (out,)}
     return width > 0 and {name: tuple(value.shape) for name, value in parameters.items()} == shapes
 
@@ -141,16 +143,18 @@ def read_compiled(source: str | PathLike[str]) -> CompiledSurface | None:
     except (ValueError, TypeError):  # types that NumPy has not, say
         return None
     settings = {key.replace("neighbour", "neighbor"): value for key, value in found.model.items()}
-    settings = {"passes": 0, "slide": 1, "fine": 1} | settings
+    settings = {"passes": 0, "slide": 1, "fine": 1, "messages": 0} | settings
     parameters, of_coarse = (_parts(found.state, prefix) for prefix in (PREFIX, COARSE + PREFIX))
     target = present_name(str(settings.pop("_target_", "")))
     fits = target == TARGET and {*SETTINGS} <= {*settings} <= {*SETTINGS, *TRAINING}
     single = all(value.dtype == np.float32 for value in found.state.values())
     whole = len(found.state) == len(parameters) + len(of_coarse)
     known = is_known(parameters) and (is_known(of_coarse) if settings.get("coarse") else not of_coarse)
-    if not (fits and single and whole and known and _sound(settings)):
+    told = known and len(parameters["out.bias"]) - OUT == settings["messages"]
+    told = told and len(of_coarse.get("out.bias", range(OUT))) == OUT
+    if not (fits and single and whole and told and _sound(settings)):
         return None
-    few = settings | {"neighbors": NEAREST, "reach": NEAREST}
+    few = settings | {"neighbors": NEAREST, "reach": NEAREST, "messages": 0}
     return CompiledSurface(settings, parameters, CompiledSurface(few, of_coarse) if of_coarse else None)
 
 
@@ -168,6 +172,6 @@ def _sound(settings: Mapping[str, Any]) -> bool:
         numbers
         and 4 <= settings["neighbors"] <= settings["reach"]
         and all(settings[name] >= 1 for name in one)
-        and min(settings["reject"], settings["passes"]) >= 0
+        and min(settings["reject"], settings["passes"], settings["messages"]) >= 0
         and 0 <= settings["slide"] <= 1
     )

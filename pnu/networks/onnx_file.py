@@ -116,7 +116,8 @@ def example_inputs(network: nn.Module) -> dict[str, Tensor]:
         offsets[..., 2] *= 0.1
         offsets = offsets.gather(1, offsets.norm(dim=-1, keepdim=True).argsort(1).expand(shape))  # nearest first
         unit = torch.nn.functional.normalize
-        return {"offsets": offsets, "normals": unit(normals, dim=-1), "hint": unit(hint, dim=-1)}
+        told = {"told": torch.rand((*shape[:2], network.messages), generator=draw)} if network.messages else {}
+        return {"offsets": offsets, "normals": unit(normals, dim=-1), "hint": unit(hint, dim=-1), **told}
     points = torch.nn.functional.normalize(torch.randn(2, int(network.patch_size), 3, generator=draw), dim=-1)  # type: ignore[arg-type]
     columns = int(getattr(network, "channels", 3))
     patch = torch.cat([points, points], -1)[..., :columns]
@@ -125,7 +126,9 @@ def example_inputs(network: nn.Module) -> dict[str, Tensor]:
 
 def output_names(network: nn.Module) -> list[str]:
     """Names of what the file of a network gives."""
-    return ["step", "normal", "log_error", "spacing"] if isinstance(network, Surface) else ["prediction"]
+    if not isinstance(network, Surface):
+        return ["prediction"]
+    return ["step", "normal", "log_error", "spacing", *["tells"] * bool(network.messages)]
 
 
 def traced(network: nn.Module, names: list[str]) -> nn.Module:

@@ -21,31 +21,40 @@ from pnu.geometry.sampling import farthest_points
 from pnu.networks.compiled_surface import NEAREST
 
 EACH = 3  # seeds of a point, in training, before they are thinned out
+OUT = 7  # numbers of the network: step, normal, logarithm of the error; then messages
+TOLD = 0.55  # share of the points of a patch, in training, that tell something: the others' neighbors are cut off
 PUSH = 0.1  # between rounds of training, beside the way from its point to a seed
 
 
 class Projector(nn.Module):
     """One step onto the surface, for queries (m, 3) with rough normals, from their k nearest points and normals."""
 
-    def __init__(self, width: int = 64, *, sphere: bool = True, attention: bool = True) -> None:
+    def __init__(self, width: int = 64, *, sphere: bool = True, attention: bool = True, messages: int = 0) -> None:
         super().__init__()
-        self.sphere, self.attend = sphere, attention
-        self.first, self.second = nn.Linear(FEATURES, width), nn.Linear(width, width)
+        self.sphere, self.attend, self.messages = sphere, attention, messages
+        self.first, self.second = nn.Linear(FEATURES + messages, width), nn.Linear(width, width)
         self.context = nn.Linear(2 * width + 1, width)
         self.third = nn.Linear(width, width)
         self.attention = nn.Linear(width, width + 2, bias=False)  # a bias changes no share
         self.head = nn.Sequential(nn.Linear(3 * width, 2 * width), nn.ReLU(), nn.Linear(2 * width, width), nn.ReLU())
-        self.out = nn.Linear(width, 7)
-        nn.init.zeros_(self.out.weight)
+        self.out = nn.Linear(width, OUT + messages)
+        nn.init.zeros_(self.out.weight[:OUT])
         nn.init.zeros_(self.out.bias)
+        nn.init.zeros_(self.first.weight[:, FEATURES:])
 
-    def forward(self, offsets: Tensor, normals: Tensor, hint: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Neighbors relative to the query (m, k, 3), their normals, the query's rough normal (m, 3) ->
+    def forward(self, offsets: Tensor, normals: Tensor, hint: Tensor, told: Tensor | None = None) -> tuple[Tensor, ...]:
+        """Neighbors relative to the query (m, k, 3), their normals, the query's rough normal (m, 3), and what the
+        neighbors tell (m, k, messages), None: nothing yet ->
 
-        step (m, 3), unit normal (m, 3), logarithm of the expected error in spacings (m,), spacing (m, 1)."""
+        step (m, 3), unit normal (m, 3), logarithm of the expected error in spacings (m,), spacing (m, 1); with messages
+        also what a point at this place tells those that look at it (m, messages), from -1 to 1."""
         with torch.no_grad():
             frame = local_frames(offsets, normals, hint, sphere=self.sphere)
-        y = self.second(self.first(frame.features).relu_()).relu_()
+        features = frame.features
+        if self.messages:
+            told = offsets.new_zeros((*offsets.shape[:2], self.messages)) if told is None else told
+            features = torch.cat([features, told], -1)
+        y = self.second(self.first(features).relu_()).relu_()
         context = self.context(torch.cat([y.amax(1), self.weighed(y.clone(), y), frame.height], -1))
         # the bias is added to the few contexts, not to the many neighbors
         y = linear(y, self.third.weight).add_((context + self.third.bias)[:, None]).relu_()
@@ -58,7 +67,8 @@ class Projector(nn.Module):
         step = torch.cat([out[:, :2], (out[:, 2] + 0.5 * bent)[:, None]], 1)
         normal = (choice[..., :1] * frame.features[..., 3:6]).sum(1) + out[:, 3:6]
         step, normal = ((v[:, None] @ frame.axes)[:, 0] for v in (step, normal))
-        return frame.base + frame.spacing * step, normalize(normal, dim=-1), out[:, 6], frame.spacing
+        tells = (out[:, OUT:].tanh(),) if self.messages else ()
+        return frame.base + frame.spacing * step, normalize(normal, dim=-1), out[:, 6], frame.spacing, *tells
 
     def weighed(self, logits: Tensor, y: Tensor) -> Tensor:
         """Sum of y (m, k, c) over the neighbors, by their `shares`: (m, c). Without gradient it overwrites logits."""
@@ -98,6 +108,8 @@ class Surface(nn.Module):
             cloud are at work
         refining: share of the crops in training whose inner points get the network's own normals first
         passes: at work, times that the normals of the cloud are replaced by those that the network finds at its points
+        messages: numbers that each point of a cloud tells those that look at it, so that these know more than their
+            own neighbors; the network finds them at the point, in each of the passes, or in one for them alone
         sphere: start from the sphere that fits the neighbors (algebraic point set surface), not from the seed
         attention: weigh the neighbors; without it all count alike
         coarse: width of a smaller network that sees the 16 nearest points and at work makes the first projections, in a
@@ -115,7 +127,7 @@ class Surface(nn.Module):
         seeds: float = 4, candidates: float | None = None, shortlist: float | None = None,
         relaxation: int = 2, refinements: int = 2, reject: float = 0.003, slide: float = 1.0,
         queries: int = 64, smoothing: float = 0.0, refining: float = 0.0, passes: int = 0,
-        sphere: bool = True, attention: bool = True, coarse: int = 0, fine: int = 1,
+        sphere: bool = True, attention: bool = True, messages: int = 0, coarse: int = 0, fine: int = 1,
     ) -> None:  # fmt: skip
         super().__init__()
         self.ratio, self.neighbors, self.reach, self.rounds = ratio, neighbors, reach, rounds
@@ -133,11 +145,12 @@ class Surface(nn.Module):
         for name, share in (("smoothing", smoothing), ("refining", refining), ("slide", slide)):
             if not 0 <= share <= 1:
                 raise ValueError(f"model.{name}={share}: expected a share from 0 to 1")
-        for name, count in (("passes", passes), ("coarse", coarse)):
+        for name, count in (("passes", passes), ("messages", messages), ("coarse", coarse)):
             if count < 0:
                 raise ValueError(f"model.{name}={count}: expected 0 or more")
         self.smoothing, self.refining, self.passes, self.slide = smoothing, refining, passes, slide
-        self.projector = Projector(width, sphere=sphere, attention=attention)
+        self.messages = messages
+        self.projector = Projector(width, sphere=sphere, attention=attention, messages=messages)
         self.coarse: Surface | None = None
         if coarse:
             few = {"neighbors": NEAREST, "reach": NEAREST, "rounds": rounds, "width": coarse}
@@ -175,15 +188,19 @@ class Surface(nn.Module):
 
         "query" and "projected" (rounds, B, queries, 6) before and after each round, "log_error" and "spacing"
         (rounds, B, queries), those of a coarse network before the others; "prediction" is the last of "projected". A
-        query has no gradient.
+        query has no gradient. With messages the first rounds are those of points of the patch, where these are found.
         """
-        patch = self.with_some_smoothed(self.with_some_refined(patch))
-        query, outward = self.training_seeds(patch)
         found: list[tuple[Tensor, ...]] = []
+        if self.messages:
+            patch = self.with_messages(self.with_some_smoothed(patch), found)
+        else:
+            patch = self.with_some_smoothed(self.with_some_refined(patch))
+        query, outward = self.training_seeds(patch[..., :6])
         for network in (self.coarse, self) if self.coarse is not None else (self,):
             place = query
             for _ in range(self.rounds):
                 projected, log_error, spacing = network.project(place, patch)
+                projected = projected[..., :6]
                 found.append((place, projected, log_error, spacing))
                 place = projected.detach() + outward
         names = ("query", "projected", "log_error", "spacing")
@@ -197,7 +214,7 @@ class Surface(nn.Module):
         if not some:
             return patch
         smooth, _, _ = self.project(patch[:some, :inner], patch[:some])
-        return torch.cat([torch.cat([smooth, patch[:some, inner:]], 1), patch[some:]])
+        return torch.cat([torch.cat([smooth[..., :6], patch[:some, inner:]], 1), patch[some:]])
 
     @torch.no_grad()
     def with_some_refined(self, patch: Tensor) -> Tensor:
@@ -211,8 +228,23 @@ class Surface(nn.Module):
             if plain < len(patch):
                 found, _, _ = self.project(patch[plain:, :inner], patch[plain:])
                 patch = patch.clone()
-                patch[plain:, :inner, 3:] = found[..., 3:]
+                patch[plain:, :inner, 3:] = found[..., 3:6]
         return patch
+
+    def with_messages(self, patch: Tensor, found: list[tuple[Tensor, ...]]) -> Tensor:
+        """Patches (B, n, 6) with what their nearer points tell, (B, n, 6 + messages), as at work: with the normals that
+        the network finds there in as many passes. Its rounds are appended to `found`."""
+        self.check_input("points", patch.shape[1])
+        inner, some = round(TOLD * patch.shape[1]), min(self.queries, round(TOLD * patch.shape[1]))
+        told = patch.new_zeros((*patch.shape[:2], self.messages))
+        for _ in range(max(1, self.passes)):
+            projected, log_error, spacing = self.project(patch[:, :inner], torch.cat([patch, told], -1))
+            found.append((patch[:, :some], projected[:, :some, :6], log_error[:, :some], spacing[:, :some]))
+            told = torch.cat([projected[..., 6:], told[:, inner:]], 1)
+            if self.passes:
+                normals = torch.cat([projected[..., 3:6].detach(), patch[:, inner:, 3:]], 1)
+                patch = torch.cat([patch[..., :3], normals], -1)
+        return torch.cat([patch, told], -1)
 
     def training_seeds(self, patch: Tensor) -> tuple[Tensor, Tensor]:
         """Seeds around the first points of patches (B, n, 6), (B, queries, 6), and a push of each, (B, queries, 6).
@@ -231,21 +263,23 @@ class Surface(nn.Module):
         return gather(seeds, kept), gather(push, kept)
 
     def project(self, query: Tensor, clouds: Tensor, idx: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """query (B, m, 6), clouds (B, n, 6) -> projected (B, m, 6), log error (B, m), spacing (B, m).
+        """query (B, m, 6), clouds (B, n, 6 + messages) -> projected (B, m, 6 + messages), log error (B, m), spacing
+        (B, m).
 
-        idx: their `neighbor_indices`, where they are known.
+        Clouds (B, n, 6) tell nothing yet. idx: their `neighbor_indices`, where they are known.
         """
         batch, m, _ = query.shape
         like = self.projector.out.weight
         idx = self.neighbor_indices(query, clouds) if idx is None else idx
         near = clouds[torch.arange(batch, device=idx.device)[:, None, None], idx]
         offsets = (near[..., :3] - query[:, :, None, :3]).flatten(0, 1).to(like)
-        step, normal, log_error, spacing = self.projector(
-            offsets, near[..., 3:].flatten(0, 1).to(like), query[..., 3:].flatten(0, 1).to(like)
+        told = near[..., 6:].flatten(0, 1).to(like) if near.shape[-1] > 6 else None
+        step, normal, log_error, spacing, *tells = self.projector(
+            offsets, near[..., 3:6].flatten(0, 1).to(like), query[..., 3:6].flatten(0, 1).to(like), told
         )
         moved = query[..., :3] + step.view(batch, m, 3).to(query)
         return (
-            torch.cat([moved, normal.view(batch, m, 3).to(query)], -1),
+            torch.cat([moved, *(values.view(batch, m, -1).to(query) for values in (normal, *tells))], -1),
             log_error.view(batch, m),
             spacing.view(batch, m),
         )

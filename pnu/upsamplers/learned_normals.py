@@ -28,5 +28,5 @@ def learned_normals(points: Floats, normals: Floats, progress: Progress = silent
         cloud = upsampler.with_refined_normals(cloud, PASSES, context)
         if noise_in_spacings(cloud) > FAINT:
             cloud = upsampler.smoothed(cloud, context)
-        found = cloud[:, 3:]
+        found = cloud[:, 3:6]
     return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-12))

@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 
 
 def network_projections(network: Surface, cloud: Floats, size: Callable[[bool], int]) -> Callable[[Floats], Floats]:
-    """Around a cloud (n, 6): queries (m, 6) -> projected and logarithm of the expected error, (m, 7).
+    """Around a cloud (n, 6 + c): queries (m, 6) -> projected, logarithm of the expected error, messages: (m, 7 + c).
 
     size(on_cpu): queries that go through the network together.
     """
@@ -30,7 +30,8 @@ def network_projections(network: Surface, cloud: Floats, size: Callable[[bool], 
     def project(query: Tensor, cloud: Tensor, idx: Tensor) -> Tensor:
         idx = idx[:, ranks]
         projected, log_error, spacing = network.project(query[None], cloud[None], idx[None])
-        return torch.cat([projected[0], (log_error[0] + spacing[0].log()).to(projected)[:, None]], 1)
+        error = (log_error[0] + spacing[0].log()).to(projected)[:, None]
+        return torch.cat([projected[0, :, :6], error, projected[0, :, 6:]], 1)
 
     return _by_neighbors(project, cloud, network.reach, like.device, size)
 
@@ -44,7 +45,7 @@ def sphere_projections(like: Tensor, cloud: Floats, k: int, size: Callable[[bool
     def project(query: Tensor, cloud: Tensor, idx: Tensor) -> Tensor:
         near = cloud[idx]
         offsets = near[..., :3] - query[:, None, :3]
-        step, normal = (x.to(query) for x in feet(*(x.to(like) for x in (offsets, near[..., 3:], query[:, 3:]))))
+        step, normal = (x.to(query) for x in feet(*(x.to(like) for x in (offsets, near[..., 3:6], query[:, 3:6]))))
         return torch.cat([query[:, :3] + step, normal, torch.zeros_like(step[:, :1])], 1)
 
     return _by_neighbors(project, cloud, k, like.device, size)

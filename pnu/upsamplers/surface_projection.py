@@ -82,11 +82,11 @@ class SurfaceProjection:
         if count >= LONG:
             compile_in_background()
         cloud = self.with_refined_normals(cloud, self.network.passes, context)
+        measured = cloud[:, :6]
+        staying = measured[:0]
         if context.smooth or noise_in_spacings(cloud) > FAINT:
-            measured, cloud = cloud, self.smoothed(cloud, context)
-            staying = cloud if count > len(cloud) and is_even(cloud, STILL_EVEN) else cloud[:0]
-        else:
-            measured, staying = cloud, cloud[:0]
+            cloud = self.smoothed(cloud, context)
+            staying = cloud[:, :6] if count > len(cloud) and is_even(cloud, STILL_EVEN) else staying
         places = cloud[:, :3]
         counts = point_counts(places, count, context.density)
         if counts is None:
@@ -103,7 +103,7 @@ class SurfaceProjection:
     def spread(
         self, cloud: Floats, kept: Floats, first: int, count: int, context: Context, *, part: bool = False
     ) -> Floats:
-        """Evenly spread points (count, 6) where the first points of a cloud (n, 6) are the nearest of its points.
+        """Evenly spread points (count, 6) where the first of a cloud (n, 6 + messages) are the nearest of its points.
 
         Those that are `kept` (k, 6) come first, as they are but for their normals; others fill the places between.
         With `part` the cloud goes on at its borders, where others make points.
@@ -149,29 +149,42 @@ class SurfaceProjection:
     def projected(
         self, query: Floats, cloud: Floats, context: Context, stage: str, begin: Callable[..., Work] | None = None
     ) -> tuple[Floats, Floats]:
-        """Queries (m, 6) on the surface of a cloud (n, 6), and the logarithm of their expected error (m,)."""
-        project = partial(begin or projections, batch_size=context.batch_size)
-        return in_parts(
-            project, query, cloud, workers=context.workers or InProcess(self.network), context=context, stage=stage
-        )
+        """Queries (m, 6) on the surface of a cloud (n, 6 + messages), and their expected errors' logarithm (m,)."""
+        found, error = self._found(query, cloud, context, stage, begin or projections)
+        return found[:, :6], error
+
+    def _found(
+        self, query: Floats, cloud: Floats, context: Context, stage: str, begin: Callable[..., Work]
+    ) -> tuple[Floats, Floats]:
+        """The same, but (m, 6 + messages)."""
+        project, workers = partial(begin, batch_size=context.batch_size), context.workers or InProcess(self.network)
+        return in_parts(project, query, cloud, workers=workers, context=context, stage=stage)
 
     def smoothed(self, cloud: Floats, context: Context) -> Floats:
-        """A noisy cloud (n, 6) with its points projected, and normals found anew there if the network finds them.
+        """A noisy cloud (n, 6 + messages) with its points projected, and normals found anew if the network finds them.
 
         None moves farther than noise may have moved it: a lone point at a tip is not drawn to the others.
         """
-        smooth, _ = self.projected(cloud, cloud, context, "smoothing, the points are noisy")
-        limit = MOVED * noise_level(cloud[:, :3], cloud[:, 3:])
+        smooth, _ = self._found(cloud[:, :6], cloud, context, "smoothing, the points are noisy", projections)
+        limit = MOVED * noise_level(cloud[:, :3], cloud[:, 3:6])
         smooth[:, :3] = no_farther(limit, cloud[:, :3], smooth[:, :3])
         if not self.network.passes:
             return smooth
-        return self.with_normals(smooth, smooth, context, "normals of the smooth points")
+        return self._anew(smooth, context, "normals of the smooth points")
 
     def with_refined_normals(self, cloud: Floats, passes: int, context: Context) -> Floats:
-        """A cloud (n, 6) with the normals that the network finds at its points, so many times one after the other."""
+        """A cloud (n, 6) with the normals that the network finds at its points, so many times one after the other, and
+        with messages, (n, 6 + messages): without passes these alone."""
         for number in range(1, passes + 1):
-            cloud = self.with_normals(cloud, cloud, context, f"normals, pass {number}")
+            cloud = self._anew(cloud, context, f"normals, pass {number}")
+        if self.network.messages and not passes:
+            cloud = np.hstack([cloud, self._anew(cloud, context, "what points tell")[:, 6:]])
         return cloud
+
+    def _anew(self, cloud: Floats, context: Context, stage: str) -> Floats:
+        """A cloud (n, 6 + messages) with the normals and the messages that the network finds at its points."""
+        found, _ = self._found(cloud[:, :6], cloud, context, stage, projections)
+        return np.hstack([cloud[:, :3], found[:, 3:]])
 
     def with_normals(
         self, kept: Floats, cloud: Floats, context: Context, stage: str = "normals of the points kept"
@@ -188,7 +201,7 @@ def _named(progress: Progress, prefix: str, stage: str, done: int, total: int) -
 def in_parts(
     begin: Begin, query: Floats, cloud: Floats, *, workers: Workers, context: Context, stage: str
 ) -> tuple[Floats, Floats]:
-    """query (m, 6) -> projected (m, 6) and logarithm of the expected error (m,)."""
+    """query (m, 6) -> projected (m, 6 + messages) and logarithm of the expected error (m,)."""
     on_cpu = str(context.device) == "cpu"
     size = queries_at_once(on_cpu, context.batch_size) * (BATCHES if on_cpu else 1)
     order = along_curve(query[:, :3])
@@ -203,18 +216,21 @@ def in_parts(
         return np.concatenate(found)
 
     context.progress(stage, 0, len(query))
-    projected, error = np.empty((len(query), 6)), np.empty(len(query))  # apart: who wants one need not keep both
+    projected, error = np.empty((0, 0)), np.empty(len(query))  # apart: who wants one need not keep both
     for first in range(0, len(query), KEPT):
         rows = order[first : first + KEPT]
         name = f"{stage}, {first} to {first + len(rows)} of {len(query)}"  # which an older version may cut otherwise
         found = context.parts.get(name, partial(project, first))
-        projected[rows], error[rows] = found[:, :6], found[:, 6]
+        if not first:
+            projected = np.empty((len(query), found.shape[1] - 1))
+        projected[rows, :6], error[rows], projected[rows, 6:] = found[:, :6], found[:, 6], found[:, 7:]
     context.progress(stage, len(query), len(query))
     return projected, error
 
 
 def projections(network: Any, cloud: Floats, batch_size: int | None = None) -> Work:
-    """Around a cloud (n, 6): queries (m, 6) -> projected and logarithm of the expected error, (m, 7)."""
+    """Around a cloud (n, 6 + messages): queries (m, 6) -> projected, logarithm of the expected error, messages, (m, 7 +
+    messages)."""
     cloud = cloud[along_curve(cloud[:, :3])]
     project = _compiled(network)
     if project is None:
@@ -281,7 +297,7 @@ def queries_at_once(on_cpu: bool, batch_size: int | None) -> int:
 
 def noise_in_spacings(cloud: Floats) -> float:
     """Noise of a cloud (n, 6) in units of the spacing of its points."""
-    return noise_level(cloud[:, :3], cloud[:, 3:]) / spacing(cloud[:, :3])
+    return noise_level(cloud[:, :3], cloud[:, 3:6]) / spacing(cloud[:, :3])
 
 
 def is_even(cloud: Floats, limit: float = EVEN) -> bool:
@@ -299,7 +315,7 @@ def seeds_around(cloud: Floats, each: int, count: int, step: Step = silent, *, f
     first = len(cloud) if first is None else first
     places = np.empty((first * (1 + each), 3))
     places[:first] = cloud[:first, :3]
-    tangent_discs(cloud[:, :3], cloud[:, 3:], each, first=first, out=places[first:].reshape(first, each, 3))
+    tangent_discs(cloud[:, :3], cloud[:, 3:6], each, first=first, out=places[first:].reshape(first, each, 3))
     owner = np.concatenate([np.arange(first, dtype=np.int32), np.arange(first, dtype=np.int32).repeat(each)])
     if first < len(cloud):
         own = _nearest(places, cloud[:, :3])[1] < first
@@ -310,7 +326,7 @@ def seeds_around(cloud: Floats, each: int, count: int, step: Step = silent, *, f
     else:
         kept = farthest_points_large(places, count, step=step)
     seeds = np.empty((len(kept), 6))
-    seeds[:, :3], seeds[:, 3:] = places.take(kept, 0), cloud[owner[kept], 3:]
+    seeds[:, :3], seeds[:, 3:] = places.take(kept, 0), cloud[owner[kept], 3:6]
     return seeds
 
 

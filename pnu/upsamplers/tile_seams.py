@@ -18,7 +18,7 @@ from pnu.io.streamed_output import cloud_writer
 from pnu.runtime.progress import Progress, silent
 from pnu.upsamplers.surface_projection import SurfaceProjection
 from pnu.upsamplers.tile_plan import Plan, attributes_of
-from pnu.upsamplers.tile_work import Whole, context_of, in_unit_sphere
+from pnu.upsamplers.tile_work import Whole, context_of, looked_at
 from pnu.upsamplers.unit_normals import with_unit_normals
 
 WIDTH = 4.0  # spacings on each side of a border where points move
@@ -48,9 +48,10 @@ def seamed(plan: Plan, number: int, whole: Whole, upsampler: SurfaceProjection) 
         others += _beside(plan, number, "seam", "made", wide)
         around = np.concatenate([dense[moving], *others])
         rows = np.load(plan.path("cloud", number))
-        cloud, frame = in_unit_sphere(rows["point"], rows["normal"])
+        context = context_of(upsampler)
+        _, cloud, frame = looked_at(plan, rows, upsampler, context)
         query = frame.to_unit(evened_out(around, len(moving)))
-        query, _ = upsampler.projected(query, cloud, context_of(upsampler), "borders")
+        query, _ = upsampler.projected(query, cloud, context, "borders")
         dense[moving] = frame.from_unit(with_unit_normals(query, cloud))
     with atomic_path(plan.path("seam", number)) as temporary:
         np.save(temporary, dense)

@@ -271,16 +271,14 @@ def made(plan: Plan, number: int, whole: Whole, upsampler: SurfaceProjection, pr
     if whole.tiles[number].area == 0:
         _save(plan, number, np.empty((0, 6)), 0)
         return
-    cloud, frame = in_unit_sphere(rows["point"], rows["normal"])
     context = context_of(upsampler, progress=progress, keep=facts.keep)
-    measured = smooth = upsampler.with_refined_normals(cloud, upsampler.network.passes, context)
-    if facts.smooth and not facts.keep:
-        smooth = upsampler.smoothed(measured, context)
+    measured, smooth, frame = looked_at(plan, rows, upsampler, context)
+    cloud = frame.to_unit(np.hstack([rows["point"], rows["normal"]]))
     found: list[NDArray[np.float64]] = []
     kept = 0
     for group, count in _groups(rows["point"], cloud, frame, whole, partial(_known, plan, number, frame)):
         others = np.setdiff1d(np.arange(len(cloud)), group)
-        fixed = measured[group] if facts.keep else measured[:0]
+        fixed = measured[group if facts.keep else group[:0], :6]
         order = np.concatenate([group, others])
         raw = upsampler.spread(smooth[order], fixed, len(group), max(count, len(fixed)), context, part=True)
         dense = frame.from_unit(with_unit_normals(raw, smooth))
@@ -295,6 +293,17 @@ def made(plan: Plan, number: int, whole: Whole, upsampler: SurfaceProjection, pr
             found.append(dense)
     points = np.concatenate(found)
     _save(plan, number, points[plan.cells.inside(points[:, :3], number)], kept)
+
+
+def looked_at(
+    plan: Plan, rows: NDArray[Any], upsampler: SurfaceProjection, context: Context
+) -> tuple[NDArray[np.float64], NDArray[np.float64], Frame]:
+    """The points of a tile as the network looks at them, measured, and smoothed where they are noisy, both (n, 6 +
+    messages) in the unit sphere, and the way back."""
+    cloud, frame = in_unit_sphere(rows["point"], rows["normal"])
+    measured = upsampler.with_refined_normals(cloud, upsampler.network.passes, context)
+    noisy = plan.facts.smooth and not plan.facts.keep
+    return measured, upsampler.smoothed(measured, context) if noisy else measured, frame
 
 
 def _save(plan: Plan, number: int, dense: np.ndarray, kept: int) -> None:

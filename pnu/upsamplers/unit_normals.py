@@ -12,7 +12,7 @@ Floats = NDArray[np.float64]
 
 
 def with_unit_normals(dense: Floats, sparse: Floats) -> Floats:
-    """Predictions (m, 3) or (m, 6) with unit normals, (m, 6); `sparse` (n, 6) is the cloud they were made from.
+    """Predictions (m, 3) or (m, 6) with unit normals, (m, 6); `sparse` (n, 6 or more) is the cloud they were made from.
 
     A predicted normal without direction becomes that of the nearest input point. Where none are predicted they are
     estimated from the predicted points, with the side of the nearest input normal. `ValueError` where a point is not
@@ -31,7 +31,7 @@ def with_unit_normals(dense: Floats, sparse: Floats) -> Floats:
         normals = normals / length
     if lost.any():
         near = PointTree(sparse[:, :3]).nearest(points[lost], 1, threads=thread_count())[1][:, 0]
-        normals[lost] = sparse[near, 3:]
+        normals[lost] = sparse[near, 3:6]
     return np.hstack([points, normals])
 
 
