@@ -172,9 +172,17 @@ def start_from(network: nn.Module, other: nn.Module, source: str | PathLike[str]
     """`fill` with the state of another network, for a training that goes on from it.
 
     Parts that the network says are optional, by the beginning of their names, stay new where the other has none, and
-    are left out where only the other has them.
+    are left out where only the other has them. Where it says that weights may be wider than the other's, what these do
+    not have stays new.
     """
     state, own = other.state_dict(), network.state_dict()
+    for name in getattr(network, "wider", ()):
+        less = state.get(name)
+        if less is not None and less.dim() == own[name].dim():
+            inside = tuple(slice(size) for size in less.shape)
+            if own[name][inside].shape == less.shape != own[name].shape:
+                state[name] = own[name].clone()
+                state[name][inside] = less
     for part in getattr(network, "optional", ()):
         new = {name: value for name, value in own.items() if name.startswith(part)}
         if not new or not any(name.startswith(part) for name in state):

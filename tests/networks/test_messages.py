@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from pnu import weights
 from pnu.fast.compiled_projector import compiled_projection
 from pnu.geometry.neighbor_search import Search
+from pnu.networks import checkpoints
 from pnu.networks.compiled_surface import read_compiled
 from pnu.networks.surface import FEATURES, OUT, TOLD, Surface
 from pnu.upsamplers.context import Context
@@ -108,6 +109,19 @@ def test_at_first_nobody_listens() -> None:
     plain.load_state_dict(state)
     for found in (upsampled(model, wavy(300), 900) for model in (told, plain)):
         np.testing.assert_allclose(found, upsampled(plain, wavy(300), 900), atol=1e-6)
+
+
+def test_a_training_begins_with_weights_of_fewer_messages() -> None:
+    more, less = (Surface(messages=messages, passes=1).eval() for messages in (8, 3))
+    nn.init.normal_(less.projector.out.weight, std=0.02)
+    nn.init.normal_(less.projector.first.weight, std=0.2)
+    checkpoints.start_from(more, less, "less")
+    cloud = wavy(200)
+    found, expected = (SurfaceProjection(model).with_refined_normals(cloud, 1, Context()) for model in (more, less))
+    np.testing.assert_allclose(found[:, :9], expected, atol=1e-6)
+    np.testing.assert_allclose(upsampled(more, cloud, 600), upsampled(less, cloud, 600), atol=1e-5)
+    with pytest.raises(ValueError, match="^more: expected the state of Surface with the arguments of its config"):
+        checkpoints.start_from(less, more, "more")
 
 
 @pytest.mark.parametrize("passes", [0, 1, 2])
