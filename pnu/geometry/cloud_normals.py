@@ -1,6 +1,7 @@
 """Normals of a whole cloud: whose axes are taken, what decides their side, and what is to be said of it."""
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ GROUND = "up, as ground and what stands on it"
 UP = np.array([0.0, 0.0, 1.0])
 LEVEL = 0.7  # height of the mean normal of what is mostly ground
 TELLING, MISSED = 1000, 0.15  # points of a sensor that tell whether it saw them, and their share that it may not have
+MOST_SCANS = 100  # whose scanners are looked for
 FAR = 100.0  # extents of a cloud from it to where it was seen from
 AGAINST = 0.2  # as much may Gauss' law speak for the other side: things on a ground are open below
 
@@ -160,15 +162,26 @@ def sight_from_within(points: np.ndarray, lines: np.ndarray, scans: np.ndarray |
     if scans is None:
         place = scanner_within(points, lines)
         return None if place is None else scanner_sight(place, float(np.ptp(points, axis=0).max()) / 2)
-    places, count = np.full(points.shape, np.nan), 0
-    for scan in np.unique(scans):
-        rows = np.flatnonzero(scans == scan)
+    groups = groups_alike(scans, TELLING)
+    looked = groups if len(groups) <= MOST_SCANS else groups[:: -(-len(groups) // MOST_SCANS)]
+    of_each, places = np.full(points.shape, np.nan), []
+    for rows in looked:
         place = camera_place(points[rows])
         place = scanner_within(points[rows], lines[rows]) if place is None else place
         if place is not None:
-            places[rows], count = place, count + 1
-    words = f"towards the scanners of {count} scan{'s' * (count > 1)}, found by their points"
-    return Sight(words, viewpoint=places) if count else None
+            of_each[rows] = place
+            places.append(place)
+    words = f"towards the scanners of {len(places)} scan{'s' * (len(places) > 1)}, found by their points"
+    if not places:
+        return None
+    return Sight(words, viewpoint=of_each) if looked is groups else Sight(words, places=np.array(places))
+
+
+def groups_alike(numbers: np.ndarray, least: int) -> list[np.ndarray]:
+    """The rows of numbers (n,) that are the same, one array for each number that there is so often at least."""
+    order = np.argsort(numbers, kind="stable")
+    bounds = np.flatnonzero(np.diff(numbers[order], prepend=np.nan, append=np.nan) != 0)
+    return [order[start:end] for start, end in pairwise(bounds) if end - start >= least]
 
 
 def camera_words(place: np.ndarray) -> str:
@@ -197,13 +210,12 @@ def _believed(found: Sight, points: np.ndarray, lines: np.ndarray) -> tuple[Sigh
     in words."""
     assert found.viewpoint is not None
     places = np.array(found.viewpoint, np.float64)
-    known = np.isfinite(places).all(1)
-    different, number = np.unique(places[known], axis=0, return_inverse=True)
+    known = np.flatnonzero(np.isfinite(places).all(1))
+    number = np.unique(places[known], axis=0, return_inverse=True)[1].ravel()
     refuted = np.zeros(len(points), bool)
-    for place, count in enumerate(np.bincount(number.ravel(), minlength=len(different))):
-        rows = np.flatnonzero(known)[number.ravel() == place]
-        if count >= TELLING and hidden(points[rows], lines[rows], different[place]).mean() > MISSED:
-            refuted[rows] = True
+    for group in groups_alike(number, TELLING):
+        rows = known[group]
+        refuted[rows] = hidden(points[rows], lines[rows], places[rows[0]]).mean() > MISSED
     if not refuted.any():
         return found, ""
     places[refuted] = np.nan

@@ -9,7 +9,7 @@ import pnu
 from bench.scenes import rescanned_room, scanned_room, yard
 from pnu.data import shapes
 from pnu.data.scanner import KINDS, Scanner
-from pnu.geometry.cloud_normals import GROUND, settled_normals
+from pnu.geometry.cloud_normals import GROUND, groups_alike, settled_normals
 from pnu.geometry.normal_estimation import complete_normals
 from pnu.geometry.scanner_within import scanner_within
 from pnu.geometry.sphere_directions import sphere_directions
@@ -69,6 +69,26 @@ def test_of_several_scanners_each_is_found_where_the_scans_are_told_apart() -> N
     assert settled.side == "towards the scanners of 2 scans, found by their points"
     with pytest.raises(ValueError, match=r"scans: expected a number for each of \d+ points, found shape \(3,\)"):
         pnu.normals(points, scans=[1, 2, 3])
+
+
+def test_groups_of_the_same_number() -> None:
+    groups = groups_alike(np.array([3, 1, 3, 2, 1, 3]), 2)
+    assert [group.tolist() for group in groups] == [[1, 4], [0, 2, 5]]
+    assert groups_alike(np.empty(0), 1) == []
+
+
+def test_of_many_scans_some_are_looked_for_and_what_sees_a_point_decides(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of a lidar that turns while it moves."""
+    monkeypatch.setattr("pnu.geometry.cloud_normals.MOST_SCANS", 1)
+    points, normals, places, scans = rescanned_room()
+    settled = settled_normals(points, None, scans=scans)
+    assert settled.side == "towards the scanners of 1 scan, found by their points"
+    assert ((settled.normals * normals).sum(1) > 0).mean() > 0.98
+    few = np.arange(len(points)) % 100  # scans of too few points to tell
+    assert ((settled_normals(points, None, scans=few).normals * normals).sum(1) > 0).mean() < 0.1
+    own = places + 1e-6 * np.random.default_rng(0).normal(size=places.shape)  # each point has a place of its own
+    settled = settled_normals(points, None, found=Sight("on the way", viewpoint=own))
+    assert ((settled.normals * normals).sum(1) > 0).mean() > 0.98
 
 
 @pytest.mark.parametrize("more", [0, 200])
