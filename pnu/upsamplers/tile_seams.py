@@ -18,18 +18,12 @@ from pnu.io.streamed_output import cloud_writer
 from pnu.runtime.progress import Progress, silent
 from pnu.upsamplers.surface_projection import SurfaceProjection
 from pnu.upsamplers.tile_plan import Plan, attributes_of
-from pnu.upsamplers.tile_work import Whole, context_of, looked_at
+from pnu.upsamplers.tile_work import Whole, beside_borders, context_of, looked_at_beside_borders, spacing_between
 from pnu.upsamplers.unit_normals import with_unit_normals
 
-WIDTH = 4.0  # spacings on each side of a border where points move
 GAP = 0.49  # of the way between two points, from their middle to the nearest other one
 CROWD = 12  # middles that may lie around another
 TURNS = 2  # more, or weaker pushes, would make borders more even than all else
-
-
-def spacing_between(whole: Whole) -> float:
-    """The distance between points made, where it is widest."""
-    return 1.08 * whole.widest  # as in a hexagonal pattern
 
 
 def seamed(plan: Plan, number: int, whole: Whole, upsampler: SurfaceProjection) -> None:
@@ -40,16 +34,15 @@ def seamed(plan: Plan, number: int, whole: Whole, upsampler: SurfaceProjection) 
     if plan.path("seam", number).is_file():
         return
     dense, kept = np.load(plan.path("made", number)), int(read_json(plan.path("kept", number, ".json")))
-    wide = WIDTH * spacing_between(whole)
+    wide = beside_borders(whole)
     depth = plan.cells.depth(dense[:, :3], number) if len(dense) else np.empty(0)
     moving = np.flatnonzero((depth < wide) & (np.arange(len(dense)) >= kept))
     if len(moving) and len(plan.tiles) > 1:
         others = [dense[np.setdiff1d(np.flatnonzero(depth < 2 * wide), moving)]]
         others += _beside(plan, number, "seam", "made", wide)
         around = np.concatenate([dense[moving], *others])
-        rows = np.load(plan.path("cloud", number))
         context = context_of(upsampler)
-        _, cloud, frame = looked_at(plan, rows, upsampler, context)
+        cloud, frame = looked_at_beside_borders(plan, number, upsampler, context)
         query = frame.to_unit(evened_out(around, len(moving)))
         query, _ = upsampler.projected(query, cloud, context, "borders")
         dense[moving] = frame.from_unit(with_unit_normals(query, cloud))
@@ -100,7 +93,7 @@ def write_tiles(plan: Plan, whole: Whole, output: str, progress: Progress = sile
     # projected points may leave the box of those measured by a little
     slack = spacing_between(whole)
     low, high = np.array(plan.facts.low) - slack, np.array(plan.facts.high) + slack
-    wide, added = WIDTH * spacing_between(whole), np.empty((0, 6))
+    wide, added = beside_borders(whole), np.empty((0, 6))
     with cloud_writer(output, whole.points, low, high, {name: np.asarray(some[name]) for name in names}) as write:
         for done, (number, wanted) in enumerate(zip(tiles, quotas, strict=True)):
             progress("writing", done, len(tiles))

@@ -41,6 +41,7 @@ SEEDS = 16  # around each of them
 REMEMBERED = 1000  # areas of a tile that stand for all
 EDGE = 0.65  # spacings that points are made beyond the last of a tile and its margin
 VOTES = 0.75  # spacings around a point of the coarse cloud where it tells the side
+WIDTH = 4.0  # spacings on each side of a border where points move
 
 Known = Callable[[NDArray[np.float64]], NDArray[np.bool_]]
 """Which places (k, 3) in the unit sphere of a tile count, (k,)."""
@@ -262,6 +263,16 @@ def _level(areas: np.ndarray, weight: np.ndarray, count: int, left: int) -> tupl
     return low, floor
 
 
+def spacing_between(whole: Whole) -> float:
+    """The distance between points made, where it is widest."""
+    return 1.08 * whole.widest  # as in a hexagonal pattern
+
+
+def beside_borders(whole: Whole) -> float:
+    """How far on each side of a border points move when tiles are joined."""
+    return WIDTH * spacing_between(whole)
+
+
 def made(plan: Plan, number: int, whole: Whole, upsampler: SurfaceProjection, progress: Progress = silent) -> None:
     """A tile made dense, all tiles being prepared: file `made`, the points in its cell, those kept first."""
     if plan.path("made", number).is_file():
@@ -274,6 +285,9 @@ def made(plan: Plan, number: int, whole: Whole, upsampler: SurfaceProjection, pr
     context = context_of(upsampler, progress=progress, keep=facts.keep)
     measured, smooth, frame = looked_at(plan, rows, upsampler, context)
     cloud = frame.to_unit(np.hstack([rows["point"], rows["normal"]]))
+    near = plan.cells.depth(rows["point"], number) < beside_borders(whole) + facts.margin
+    with atomic_path(plan.path("border", number)) as temporary:
+        np.save(temporary, smooth[near].astype(np.float32))
     found: list[NDArray[np.float64]] = []
     kept = 0
     for group, count in _groups(rows["point"], cloud, frame, whole, partial(_known, plan, number, frame)):
@@ -304,6 +318,17 @@ def looked_at(
     measured = upsampler.with_refined_normals(cloud, upsampler.network.passes, context)
     noisy = plan.facts.smooth and not plan.facts.keep
     return measured, upsampler.smoothed(measured, context) if noisy else measured, frame
+
+
+def looked_at_beside_borders(
+    plan: Plan, number: int, upsampler: SurfaceProjection, context: Context
+) -> tuple[NDArray[np.float64], Frame]:
+    """The points near the borders of a tile that was made, as the network looks at them, and the way back."""
+    rows = np.load(plan.path("cloud", number))
+    if not plan.path("border", number).is_file():  # of an older version
+        return looked_at(plan, rows, upsampler, context)[1:]
+    frame = in_unit_sphere(rows["point"], rows["normal"])[1]
+    return np.load(plan.path("border", number)).astype(np.float64), frame
 
 
 def _save(plan: Plan, number: int, dense: np.ndarray, kept: int) -> None:

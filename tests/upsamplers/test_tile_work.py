@@ -73,6 +73,21 @@ def test_as_many_points_as_without_tiles_and_the_same_in_any_order(tmp_path: Pat
     np.testing.assert_array_equal(make(plan), dense)
 
 
+def test_beside_borders_the_network_looks_at_the_points_as_inside(tmp_path: Path) -> None:
+    """With the normals that it found itself, and what points tell; kept, or found again."""
+    plan = plan_of(tmp_path, sheet(600), 320)
+    kept = make(plan)
+    rows, near = np.load(plan.path("cloud", 0)), np.load(plan.path("border", 0))
+    with tile_work.working(tile_work.run_of(plan)) as upsampler:
+        assert near.shape[1] == 6 + upsampler.network.messages > 6
+        cloud, _ = tile_work.in_unit_sphere(rows["point"], rows["normal"])
+        assert np.abs(near[:, 3:6] - cloud[cKDTree(cloud[:, :3]).query(near[:, :3])[1], 3:]).max() > 1e-3
+    for number in plan.tiles:
+        plan.path("border", number).unlink()
+        plan.path("seam", number).unlink()
+    np.testing.assert_allclose(make(plan), kept, atol=1e-3)
+
+
 def test_borders_have_the_spacing_of_the_inside(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, sheet(2400), 600, normals=np.tile([0.0, 0.0, 1.0], (2400, 1)), ratio=2)
     dense = make(plan)
