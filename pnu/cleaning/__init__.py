@@ -34,6 +34,7 @@ class Cleaned(NamedTuple):
     stray: NDArray[np.int64]  # rows of the cloud before that were taken out as stray
     character: Character = "clean"  # of a cloud without normals; what has them is "clean"
     estimated: Settled | None = None  # rough normals of a cloud that has none, where they are known
+    seen: bool = False  # a sensor, or what was asked for, decided the side of its normals
     camera: NDArray[np.float64] | None = None  # place (3,) from which all of a cloud without normals was seen
 
     @property

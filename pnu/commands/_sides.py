@@ -80,4 +80,5 @@ def cleaned(cfg: Any, cloud: "Cloud", **treatments: Any) -> tuple["Cleaned", "Cl
     settled = found.estimated if found.estimated is not None and not told else None
     settled = settled or sided(cfg, found.cloud, learned=False, places=places)
     whole = with_normals(found.cloud, settled)
+    found = found._replace(seen=settled.seen)
     return (found._replace(cloud=whole) if own else found._replace(estimated=settled)), whole

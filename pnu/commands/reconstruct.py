@@ -76,7 +76,9 @@ def reconstruct(cfg: Any) -> None:
         warn(text)
     depth = reconstruction.octree_depth(points) if cfg.depth is None else cfg.depth
     with busy(f"Poisson reconstruction, depth {depth}", cfg.quiet):
-        surface = reconstruction.reconstruct(points, normals, depth=depth, timeout=cfg.timeout, name=cfg.input)
+        surface = reconstruction.reconstruct(
+            points, normals, depth=depth, outward=not settled.seen, timeout=cfg.timeout, name=cfg.input
+        )
     if cfg.reach is not None:
         before, surface = len(surface.mesh.vertices), reconstruction.cut_off(surface, points, cfg.reach)
         if gone := before - len(surface.mesh.vertices):

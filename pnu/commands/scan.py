@@ -88,7 +88,7 @@ def scan(cfg: Any) -> None:
     depth = reconstruction.octree_depth(dense) - coarser if cfg.depth is None else cfg.depth
     with busy(f"surface, depth {depth}", cfg.quiet):
         surface = reconstruction.reconstruct(
-            dense[:, :3], dense[:, 3:], depth=depth, timeout=cfg.timeout, name=cfg.input
+            dense[:, :3], dense[:, 3:], depth=depth, outward=not cleaned.seen, timeout=cfg.timeout, name=cfg.input
         )
     if cfg.reach is not None:
         whole = len(surface.mesh.vertices)

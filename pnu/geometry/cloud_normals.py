@@ -37,6 +37,7 @@ class Settled(NamedTuple):
     normals: np.ndarray  # (n, 3) of length 1
     words: str  # a line: how many are whose, how many were turned over, what decided their side
     side: str  # what decided that; empty where all are as given
+    seen: bool = False  # it was a sensor, or what was asked for, and not the shape
 
 
 def settled_normals(
@@ -103,7 +104,8 @@ def settled_normals(
     sign = np.where(anew, sign, 1)
     settled = np.empty(points.shape)
     settled[order] = lines * sign[:, None]
-    return Settled(settled, _words(known, int((sign[known] < 0).sum()), why, side + doubt), side)
+    words = _words(known, int((sign[known] < 0).sum()), why, side + doubt)
+    return Settled(settled, words, side, seen=sight is not None)
 
 
 def check_not_a_line(points: np.ndarray) -> None:

@@ -30,7 +30,7 @@ BOX = 1.1  # side of the octree over that of the points' bounding box
 class ReconstructedSurface(NamedTuple):
     """A reconstructed surface."""
 
-    mesh: Mesh  # outward, where it is closed
+    mesh: Mesh  # outward, where it is closed and was to be
     density: Array  # (v,) octree depth at which there are points: low where the surface was made up between them
     depth: int
     inside_out: bool  # the normals looked inward; the faces were turned
@@ -42,7 +42,7 @@ class ReconstructedSurface(NamedTuple):
         """What is wrong with the surface, a line each; nothing if all went well."""
         found = []
         if self.inside_out:
-            found.append("the normals look inward; the surface was turned outward")
+            found.append("the normals look inward; the surface was turned outward (side=in: a room, it stays)")
         if self.contradicted > 0.03:
             found.append(
                 f"{self.contradicted:.0%} of the normals contradict the surface; estimate them anew, unless the shape "
@@ -59,8 +59,8 @@ class ReconstructedSurface(NamedTuple):
 
 
 def reconstruct(
-    points: np.ndarray, normals: np.ndarray, *, depth: int | None = None, box: float = BOX, timeout: float = 600,
-    name: str = "cloud",
+    points: np.ndarray, normals: np.ndarray, *, depth: int | None = None, box: float = BOX, outward: bool = True,
+    timeout: float = 600, name: str = "cloud",
 ) -> ReconstructedSurface:  # fmt: skip
     """The surface through points `(n, 3)` along normals `(n, 3)`; those of no length are estimated. In their frame.
 
@@ -69,6 +69,8 @@ def reconstruct(
     Args:
         depth: of the octree, one more halves its cells; default: cells of half the points' spacing.
         box: side of the octree over that of the points' bounding box: beyond it there is no surface.
+        outward: turn the faces of a closed surface whose normals look inward; else they look as the normals do, into
+            a room that was seen from within.
         timeout: seconds.
         name: of the cloud in messages.
 
@@ -87,7 +89,7 @@ def reconstruct(
     mesh = Mesh(found["vertices"] * radius + center, found["faces"].astype(np.int64))
     if not len(mesh.faces):
         raise ValueError(f"{name}: Poisson reconstruction found no surface; normals that contradict each other do that")
-    inside_out = open_edges(mesh) == 0 and signed_volume(mesh) < 0
+    inside_out = outward and open_edges(mesh) == 0 and signed_volume(mesh) < 0
     if inside_out:
         mesh = mesh._replace(faces=mesh.faces[:, ::-1])
     far = FAR * spacing(points)

@@ -96,6 +96,17 @@ def test_open_truth_and_inward_normals_are_said(
     assert "normals look inward" in said[1]
 
 
+@pytest.mark.parametrize("keys", [{"viewpoint": "0,0,0"}, {"side": "in"}])
+def test_what_was_seen_from_within_looks_inward(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], keys: dict[str, str]
+) -> None:
+    cloud = sphere_points(800)
+    write_cloud(tmp_path / "in.ply", cloud[:, :3], cloud[:, 3:] if "side" in keys else None)
+    run(reconstruct, input=tmp_path / "in.ply", output=tmp_path / "out.ply", **keys)
+    assert "inward" not in capsys.readouterr().err
+    assert signed_volume(read_mesh(tmp_path / "out.ply")) == pytest.approx(-4 / 3 * np.pi, rel=0.05)
+
+
 @pytest.mark.parametrize(
     ("keys", "message"),
     [

@@ -84,6 +84,13 @@ def test_inward_normals_are_noticed_in_any_frame_and_the_surface_turned() -> Non
     np.testing.assert_allclose(surface.mesh.vertices.mean(0), away, atol=3)
 
 
+def test_a_room_that_was_seen_from_within_stays_as_it_was_seen() -> None:
+    cloud = sphere_points(1500)
+    surface = reconstruction.reconstruct(cloud[:, :3], -cloud[:, 3:], outward=False)
+    assert surface.warnings() == []
+    assert signed_volume(surface.mesh) == pytest.approx(-4 / 3 * np.pi, rel=0.02)
+
+
 def test_contradicting_normals_are_noticed() -> None:
     cloud = sphere_points(1500)
     cloud[np.random.default_rng(0).random(1500) < 0.2, 3:] *= -1
