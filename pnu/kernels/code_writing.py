@@ -18,7 +18,7 @@ import numpy as np
 from pnu.io import atomic_path
 from pnu.kernels.code_loading import BOOLEAN, POINTER, WORD, load_code, word_types
 
-ALLOWED = {"malloc", "free", "log", "logf", "memcpy", "memmove", "memset"}  # of the C library
+ALLOWED = {"malloc", "free", "log", "logf", "tanh", "tanhf", "memcpy", "memmove", "memset"}  # of the C library
 NAMES = {POINTER: "ptr", WORD: "i64", BOOLEAN: "i8"}
 HEAD = 48  # bytes before the numbers of an array: how many use it, two unused words, where they are, their size, unused
 PATIENCE = 300  # seconds, on a busy machine
