@@ -9,13 +9,14 @@ SAME_SIDE = 0.2  # cosine between normals below which a neighbor counts as anoth
 KINDS, OFTEN = 32, 8  # different values at most, each so often on average, that tell kinds apart and are no amounts
 
 
-def carry(dense: np.ndarray, sparse: np.ndarray, values: np.ndarray) -> np.ndarray:
+def carry(dense: np.ndarray, sparse: np.ndarray, values: np.ndarray, *, kinds: bool = False) -> np.ndarray:
     """Values at new points on the same surface, from those at known points, never across a sheet to its other side.
 
     dense (m, 6) and sparse (n, 6), points and unit normals; values (n,) or (n, c) -> (m,) or (m, c), same dtype.
     Mean of the nearest 6 with weights 1 / d^2 times the cosine between the normals, of those that face the same way;
     where none does, the nearest. Whole numbers are rounded. What tells kinds apart, as classes, numbers of scans and
-    truth values do, has no mean: it is the kind of the greatest weight.
+    truth values do, has no mean: it is the kind of the greatest weight. That is what has few different values, or with
+    `kinds` any.
     """
     k = min(2 * NEIGHBORS, len(sparse))
     dist, idx = PointTree(sparse[:, :3]).nearest(dense[:, :3], k)
@@ -27,21 +28,21 @@ def carry(dense: np.ndarray, sparse: np.ndarray, values: np.ndarray) -> np.ndarr
     lost = ~alike.any(1)
     weight[lost, 0] = 1
     weight /= weight.sum(1, keepdims=True)
-    if (kinds := _kinds(values)) is not None:
-        return np.asarray(values[idx[np.arange(len(dense)), _heaviest(weight, kinds[idx])]])
+    if (number := _kinds(values, kinds)) is not None:
+        return np.asarray(values[idx[np.arange(len(dense)), _heaviest(weight, number[idx])]])
     mean: np.ndarray = np.einsum("mk,mk...->m...", weight, values[idx].astype(np.float64))
     if np.issubdtype(values.dtype, np.integer):
         mean = mean.round()
     return mean.astype(values.dtype)
 
 
-def _kinds(values: np.ndarray) -> np.ndarray | None:
+def _kinds(values: np.ndarray, known: bool) -> np.ndarray | None:
     """Numbers (n,) of the different values (n,) or rows (n, c), where these are kinds; None: they are amounts."""
     amounts = np.issubdtype(values.dtype, np.number) and not np.issubdtype(values.dtype, np.complexfloating)
-    if amounts and values.ndim > 1:
+    if amounts and values.ndim > 1 and not known:
         return None
     different, number = np.unique(values, axis=0, return_inverse=True)
-    if amounts and len(different) > min(KINDS, len(values) / OFTEN):
+    if amounts and not known and len(different) > min(KINDS, len(values) / OFTEN):
         return None
     return np.asarray(number.reshape(-1))
 

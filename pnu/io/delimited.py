@@ -227,6 +227,7 @@ def read_ptx(path: Path) -> tuple[Text, dict[str, np.ndarray]]:
         try:
             size = int(head[0]) * int(head[1])
             matrix = np.array([[float(word) for word in line.split()] for line in head[6:]])
+            place = np.array([float(word) for word in head[2].split()])
             if size < 0 or matrix.shape != (4, 4) or any(len(line.split()) != 3 for line in head[2:6]):
                 raise ValueError
         except (ValueError, IndexError):
@@ -248,7 +249,6 @@ def read_ptx(path: Path) -> tuple[Text, dict[str, np.ndarray]]:
         scan = values[seen]
         scan[:, :3] = scan[:, :3] @ matrix[:3, :3] + matrix[3, :3]
         scans.append(scan)
-        place = np.array([float(word) for word in head[2].split()])
         places.append(matrix[3, :3] if matrix[3, :3].any() else place)
     if not scans:
         raise ValueError(f"{path}: holds no points; expected ptx")

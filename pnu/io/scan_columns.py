@@ -5,7 +5,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 STOOD = ("sensor_x", "sensor_y", "sensor_z")
+KINDS = frozenset({"classification", "class", "label", "segment", "instance", "cluster"})
 SCANS = frozenset({"scan", "scanid", "scanindex", "scannumber", "pointsourceid", "station", "stationid"})
+
+
+def tells_apart(name: str) -> bool:
+    """Whether a column of that name numbers kinds or scans, or says where these stood: never an amount."""
+    plain = name.lower().removeprefix("scalar_").replace("_", "")
+    return plain in SCANS | KINDS or name in STOOD
 
 
 def columns_of_scans(

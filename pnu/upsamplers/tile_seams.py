@@ -14,6 +14,7 @@ from pnu.geometry.attributes import carry
 from pnu.geometry.even_spacing import REACH, USUAL, pushed_apart
 from pnu.geometry.point_tree import PointTree
 from pnu.io import atomic_path, kept_attributes, read_json
+from pnu.io.scan_columns import tells_apart
 from pnu.io.streamed_output import cloud_writer
 from pnu.runtime.progress import Progress, silent
 from pnu.upsamplers.surface_projection import SurfaceProjection
@@ -106,7 +107,7 @@ def write_tiles(plan: Plan, whole: Whole, output: str, progress: Progress = sile
             rows = np.load(plan.path("cloud", number))
             sparse = np.hstack([rows["point"], rows["normal"]])
             values = attributes_of(rows)
-            carried = {name: carry(dense, sparse, values[name]) for name in names}
+            carried = {name: carry(dense, sparse, values[name], kinds=tells_apart(name)) for name in names}
             write(dense[:, :3], dense[:, 3:], carried)
         progress("writing", len(tiles), len(tiles))
     return whole.points, names

@@ -24,6 +24,7 @@ from pnu.geometry.point_tree import PointTree
 from pnu.geometry.unit_sphere import Frame, unit_sphere_frame
 from pnu.io import Cloud, check_cloud
 from pnu.io.library_clouds import Kind, LibraryCloud, kind_of, tensor_like
+from pnu.io.scan_columns import tells_apart
 from pnu.io.sensor import asked_sight
 from pnu.networks.compiled_surface import CompiledSurface
 from pnu.runtime.parts import Parts
@@ -313,7 +314,7 @@ def attributes(dense: np.ndarray, cloud: Cloud) -> dict[str, np.ndarray]:
     normals = complete_normals(cloud.points, cloud.normals)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     sparse = np.hstack([cloud.points, normals / np.maximum(length, 1e-300)])
-    return {name: carry(dense, sparse, values) for name, values in cloud.attributes.items()}
+    return {name: carry(dense, sparse, values, kinds=tells_apart(name)) for name, values in cloud.attributes.items()}
 
 
 def attributes_with_filled(dense: np.ndarray, cloud: Cloud, count: int) -> dict[str, np.ndarray]:

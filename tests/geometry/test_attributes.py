@@ -8,6 +8,7 @@ import pytest
 
 from pnu.geometry.attributes import carry
 from pnu.io import read_cloud, write_cloud
+from pnu.io.scan_columns import tells_apart
 
 RNG = np.random.default_rng(0)
 
@@ -76,6 +77,16 @@ def test_the_kind_of_the_greatest_weight() -> None:
     kinds[0] = 9
     assert carry(np.array([[0.0, 0, 0, 0, 0, 1]]), sparse, kinds)[0] == 1
     assert carry(np.array([[0.4, 0, 0, 0, 0, 1]]), sparse, kinds)[0] == 9
+
+
+def test_numbers_of_many_scans_are_no_amounts() -> None:
+    sparse, dense = plane(400), plane(300)
+    numbers = np.arange(400) // 4  # more than are taken for kinds by themselves
+    assert set(carry(dense, sparse, 1000 * numbers)) - set(1000 * numbers)
+    assert set(carry(dense, sparse, 1000 * numbers, kinds=True)) <= set(1000 * numbers)
+    names = ("scan", "point_source_id", "scalar_Classification", "sensor_x", "Label")
+    assert all(map(tells_apart, names))
+    assert not any(map(tells_apart, ("intensity", "gps_time", "scan_angle", "z")))
 
 
 def test_point_that_faces_no_neighbor_takes_the_nearest() -> None:

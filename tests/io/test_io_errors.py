@@ -38,6 +38,7 @@ BAD_CLOUDS = {
     "commas.csv": (b"1,05,-2,50,3,75\n" * 20, "line 1: commas stand between numbers and within them; write decimal"),
     "cut.ptx": (b"5\n4\n" + b"0 0 0\n" * 4 + b"1 0 0 0\n" * 4 + b"1 2 3 0.5\n" * 19, "promises 20 points, holds 19"),
     "endless.ptx": (b"99999999999999999999\n1\n" + b"0 0 0\n" * 4 + b"1 0 0 0\n" * 4, "promises 99999999999999999999"),
+    "words.ptx": (b"1\n1\na b c\n" + b"0 0 0\n" * 3 + b"1 0 0 0\n" * 4 + b"1 2 3 0.5\n", "expected ptx: two counts"),
     "pts.ptx": (ROWS.encode(), "expected ptx: two counts"),
     "text.npz": (b"PK\x03\x04" + bytes(99), "is no npz file of numbers"),
     "comments.xyz": (b"# nothing\n" * 20, "holds no numbers"),
