@@ -117,6 +117,11 @@ def matching(names: tuple[str, ...], columns: Mapping[str, np.ndarray]) -> list[
     return [name for name in found if name is not None] if None not in found else []
 
 
+def plain_name(name: str) -> str:
+    """A column's name in small letters, without underscores and the prefix of a scalar."""
+    return name.lower().removeprefix("scalar_").replace("_", "")
+
+
 def as_colors(values: np.ndarray, most: float | None = None) -> np.ndarray:
     """uint8 of colors in 0..1 (floats), 0..255, or 16 bits (0..65535); `most`: of all, where these are a part."""
     if values.dtype == np.uint8:
