@@ -117,7 +117,7 @@ def matching(names: tuple[str, ...], columns: Mapping[str, np.ndarray]) -> list[
     return [name for name in found if name is not None] if None not in found else []
 
 
-def plain_name(name: str) -> str:
+def bare_name(name: str) -> str:
     """A column's name in small letters, without underscores and the prefix of a scalar."""
     return name.lower().removeprefix("scalar_").replace("_", "")
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pnu.io.fields import plain_name
+from pnu.io.fields import bare_name
 
 STOOD = ("sensor_x", "sensor_y", "sensor_z")
 KINDS = frozenset({"classification", "class", "label", "segment", "instance", "cluster"})
@@ -13,7 +13,7 @@ SCANS = frozenset({"scan", "scanid", "scanindex", "scannumber", "pointsourceid",
 
 def tells_apart(name: str) -> bool:
     """Whether a column of that name numbers kinds or scans, or says where these stood: never an amount."""
-    return plain_name(name) in SCANS | KINDS or name in STOOD
+    return bare_name(name) in SCANS | KINDS or name in STOOD
 
 
 def columns_of_scans(
@@ -35,7 +35,7 @@ def columns_of_scans(
 def scan_numbers(attributes: Mapping[str, np.ndarray]) -> np.ndarray | None:
     """Which scan each point is of, (n,), where columns say so and there are several."""
     for name, values in attributes.items():
-        if plain_name(name) in SCANS and values.ndim == 1:
+        if bare_name(name) in SCANS and values.ndim == 1:
             different, number = np.unique(values, return_inverse=True)
             return np.asarray(number) if len(different) > 1 else None
     return None

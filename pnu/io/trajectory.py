@@ -8,7 +8,7 @@ import numpy as np
 
 from pnu.io.cloud import TEXTS, read_cloud
 from pnu.io.delimited import read_text
-from pnu.io.fields import POINTS, matching, plain_name
+from pnu.io.fields import POINTS, bare_name, matching
 
 PLACES = (*POINTS, *((f"{name}x", f"{name}y", f"{name}z") for name in ("t", "pos_", "position_", "p_")))
 TIMES = frozenset({"time", "t", "timestamp", "gpstime", "gpsseconds", "seconds", "sec", "stamp"})
@@ -36,7 +36,7 @@ class Trajectory(NamedTuple):
 def times_of(columns: dict[str, np.ndarray]) -> np.ndarray | None:
     """The times among columns (n,), by their names."""
     for name, values in columns.items():
-        if plain_name(name) in TIMES and values.ndim == 1:
+        if bare_name(name) in TIMES and values.ndim == 1:
             return values.astype(np.float64)
     return None
 
