@@ -27,7 +27,8 @@ class ProjectionDataModule(EpochDataModule):
         noisy: share of the clouds that has noise
         given: share of the crops that has given normals where they are mixed
         clouds: of an epoch, each drawn anew
-        pool: clouds that are drawn at all, and used again and again; null: as many as are used
+        pool: clouds that are drawn at all, and used again and again; null: as many as are used; several
+            workers draw them before the training
         size: points of a crop
         views: crops of a cloud
         batch_size: clouds of a batch, on each device
@@ -94,6 +95,8 @@ class ProjectionDataModule(EpochDataModule):
             given=self.given,
             seed=self.seed,
         )
+        if self.pool is not None and self.workers > 1:
+            train.draw_pool(self.workers)
         clouds = {
             part: WholeClouds(held_out, self.points, normals=self.normals, sides=self.sides, seed=seed)
             for part, seed in (("val", 1), ("test", 2))

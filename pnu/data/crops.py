@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset
+from torch.utils.data import DataLoader, Dataset
 
 from pnu.data.scanner import Scanner, any_scan
 from pnu.geometry.anisotropy import averaged, thinned_lines
@@ -15,6 +15,7 @@ from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.mesh_sampling import sample_area, sample_poisson_disk
 from pnu.geometry.normal_estimation import estimate_normals, refit_normals
 from pnu.io import Mesh
+from pnu.runtime.progress import counted
 
 LEAST, MOST = 600, 8000  # points of a cloud, evenly spread in the logarithm, for half of the clouds
 USUAL = (1500, 6500)  # and for the other half
@@ -33,6 +34,20 @@ class Drawn(NamedTuple):
     clean: np.ndarray  # (n, 6)
     noisy: np.ndarray  # (n, 6)
     rough: np.ndarray  # (n, 3) normals of the input
+
+
+class Pool:
+    """Clouds that are used again and again, in memory that processes share."""
+
+    def __init__(self, clouds: Sequence[Drawn]) -> None:
+        self.shapes = [cloud.shape for cloud in clouds]
+        self.ends = np.cumsum([0, *(len(cloud.clean) for cloud in clouds)])
+        rows = np.vstack([np.hstack([cloud.clean, cloud.noisy, cloud.rough]) for cloud in clouds])
+        self.rows = torch.from_numpy(rows).share_memory_()
+
+    def __getitem__(self, number: int) -> Drawn:
+        rows = self.rows[self.ends[number] : self.ends[number + 1]].numpy()
+        return Drawn(self.shapes[number], rows[:, :6], rows[:, 6:12], rows[:, 12:])
 
 
 class Crops(Dataset[dict[str, Any]]):
@@ -86,7 +101,7 @@ class Crops(Dataset[dict[str, Any]]):
         self.names, self.meshes = list(meshes), list(meshes.values())
         self.length, self.size, self.views, self.blue, self.least = length, size, views, blue, least
         self.noise, self.noisy, self.found_sides, self.pool = noise, noisy, sides == "found", pool
-        self.drawn: dict[int, Drawn] = {}
+        self.drawn: dict[int, Drawn] | Pool = {}
         self.estimated, self.given = normals != "given", given if normals == "mixed" else 0.0
         self.scans, self.seed = scans, seed
         self.scanners = [Scanner(mesh) for mesh in self.meshes]
@@ -101,8 +116,8 @@ class Crops(Dataset[dict[str, Any]]):
             found = self.draw(rng)
         else:
             number = index % self.pool
-            if number not in self.drawn:
-                self.drawn[number] = self.draw(np.random.default_rng((self.seed, number)))
+            if isinstance(self.drawn, dict) and number not in self.drawn:
+                self.drawn[number] = self.pooled(number)
             found = self.drawn[number]
         shape = found.shape
         views = [self.crop(found.clean, found.noisy, found.rough, rng) for _ in range(self.views)]
@@ -111,6 +126,20 @@ class Crops(Dataset[dict[str, Any]]):
             "index": torch.full((self.views,), shape),
             "shape": [self.names[shape]] * self.views,
         }
+
+    def pooled(self, number: int) -> Drawn:
+        """A cloud of the pool, drawn."""
+        return self.draw(np.random.default_rng((self.seed, number)))
+
+    def draw_pool(self, workers: int) -> None:
+        """Draw the clouds of the pool by so many processes, for all that draw crops from them: else each of these
+        draws all that it uses."""
+        assert self.pool is not None
+        # spawned workers: a fork of a process with threads may hang
+        drawn = DataLoader(
+            PooledClouds(self), batch_size=None, num_workers=workers, multiprocessing_context="spawn", collate_fn=as_is
+        )
+        self.drawn = Pool(list(counted(drawn, self.pool, "clouds")))
 
     def draw(self, rng: np.random.Generator) -> Drawn:
         """A cloud of one of the meshes."""
@@ -187,6 +216,24 @@ class Crops(Dataset[dict[str, Any]]):
             noisy[:, 3:] += rng.uniform(0, 0.15) * rng.standard_normal((n, 3))
             noisy[:, 3:] /= np.linalg.norm(noisy[:, 3:], axis=1, keepdims=True)
         return clean, noisy
+
+
+class PooledClouds(Dataset[Drawn]):
+    """Those of a pool, drawn one after the other."""
+
+    def __init__(self, crops: Crops) -> None:
+        self.crops = crops
+
+    def __len__(self) -> int:
+        return self.crops.pool or 0
+
+    def __getitem__(self, number: int) -> Drawn:
+        return self.crops.pooled(number)
+
+
+def as_is(cloud: Any) -> Any:
+    """Arrays instead of tensors."""
+    return cloud
 
 
 def rough_normals(points: np.ndarray, true: np.ndarray) -> np.ndarray:

@@ -6,14 +6,15 @@ corrects both. How clouds become dense with it, is in `pnu.upsamplers.surface_pr
 """
 
 import copy
+from functools import lru_cache
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear, normalize
 
-from pnu.geometry.even_spacing import tangent_discs
-from pnu.geometry.local_frames import FEATURES, local_frames
+from pnu.geometry.even_spacing import GOLDEN_ANGLE, RANK, tangent_discs
+from pnu.geometry.local_frames import FEATURES, local_frames, tangent_basis
 from pnu.geometry.neighbor_features import gather
 from pnu.geometry.neighbor_ranks import neighbor_ranks
 from pnu.geometry.neighbor_search import knn
@@ -254,9 +255,11 @@ class Surface(nn.Module):
         """
         self.check_input("points", patch.shape[1])
         count = self.queries
-        arrays = patch.detach().cpu().numpy()
-        seeds_of = [tangent_discs(p[:, :3], p[:, 3:], EACH, first=count) for p in arrays]
-        discs = torch.from_numpy(np.stack(seeds_of)).to(patch)
+        if patch.device.type == "cpu":
+            seeds_of = [tangent_discs(p[:, :3], p[:, 3:], EACH, first=count) for p in patch.detach().numpy()]
+            discs = torch.from_numpy(np.stack(seeds_of)).to(patch)
+        else:
+            discs = discs_of_patches(patch.detach(), EACH, first=count)
         parents = patch[:, :count, None].expand(-1, -1, EACH, -1)
         seeds = torch.cat([discs, parents[..., 3:]], -1).flatten(1, 2)
         push = torch.cat([PUSH * (discs - parents[..., :3]), torch.zeros_like(discs)], -1).flatten(1, 2)
@@ -272,7 +275,7 @@ class Surface(nn.Module):
         batch, m, _ = query.shape
         like = self.projector.out.weight
         idx = self.neighbor_indices(query, clouds) if idx is None else idx
-        near = clouds[torch.arange(batch, device=idx.device)[:, None, None], idx]
+        near = gather(clouds, idx)
         offsets = (near[..., :3] - query[:, :, None, :3]).flatten(0, 1).to(like)
         told = near[..., 6:].flatten(0, 1).to(like) if near.shape[-1] > 6 else None
         step, normal, log_error, spacing, *tells = self.projector(
@@ -288,7 +291,8 @@ class Surface(nn.Module):
     def neighbor_indices(self, query: Tensor, clouds: Tensor) -> Tensor:
         """Points of clouds (B, n, 6) that queries (B, m, 6) look at: (B, m, k)."""
         n = clouds.shape[1]
-        return knn(query[..., :3], clouds[..., :3], min(self.reach, n)).idx[..., self.ranks(n)]
+        nearest = knn(query[..., :3], clouds[..., :3], min(self.reach, n)).idx
+        return nearest.index_select(-1, ranks_on(nearest.device, self.neighbors, self.reach, n))
 
     def ranks(self, n: int) -> list[int]:
         """Ranks of the neighbors that are looked at, of those that a cloud of n points has."""
@@ -297,3 +301,30 @@ class Surface(nn.Module):
     def forward(self, patch: Tensor) -> Tensor:
         """As in training: patch (B, n, 6) -> (B, queries, 6). Whole clouds: `pnu.upsamplers.surface_projection`."""
         return self.outputs(patch)["prediction"]
+
+
+@lru_cache(maxsize=8)
+def ranks_on(device: torch.device, neighbors: int, reach: int, n: int) -> Tensor:
+    """`neighbor_ranks` on a device, kept there: sending them each time would have it wait."""
+    return torch.tensor(neighbor_ranks(neighbors, reach, n), device=device)
+
+
+def discs_of_patches(patch: Tensor, count: int, *, first: int) -> Tensor:
+    """`tangent_discs` of the first points of patches (B, n, 6), (B, first, count, 3), all at once on their device."""
+    n = patch.shape[1]
+    points, normals = patch[:, :first, :3], patch[:, :first, 3:6]
+    near = knn(points, patch[..., :3], min(RANK, n - 1) + 1)
+    radius = near.dist_sq[..., -1:].sqrt()
+    toward = gather(patch[..., :3], near.idx[..., 1]) - points
+    along = toward - (toward * normals).sum(-1, keepdim=True) * normals
+    short = along.norm(dim=-1, keepdim=True) <= 1e-6 * radius
+    aside, _ = tangent_basis(normals.flatten(0, 1))
+    along = normalize(torch.where(short, aside.view_as(along), along), dim=-1)
+    across = torch.linalg.cross(normals, along)
+    point = torch.arange(points.shape[1], device=patch.device, dtype=patch.dtype)[:, None]
+    seed = torch.arange(count, device=patch.device, dtype=patch.dtype)
+    share = (seed + (point / GOLDEN_ANGLE) % 1) / count
+    angle = GOLDEN_ANGLE * (seed + count * point)
+    x, y = (radius * share.sqrt() * turned for turned in (angle.cos(), angle.sin()))
+    discs: Tensor = points[:, :, None] + x[..., None] * along[:, :, None] + y[..., None] * across[:, :, None]
+    return discs

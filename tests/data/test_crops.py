@@ -14,7 +14,7 @@ import torch
 from pnu.commands.train import main as train
 from pnu.data import shapes
 from pnu.data.crop_module import ProjectionDataModule
-from pnu.data.crops import WRONG, Crops, WholeClouds, flattened
+from pnu.data.crops import WRONG, Crops, Pool, WholeClouds, flattened
 from pnu.data.mesh_scene import MeshScene
 from pnu.data.patch_module import PatchDataModule
 from pnu.geometry.cloud_normals import settled_normals
@@ -120,6 +120,20 @@ def test_clouds_of_a_pool_are_used_again_in_other_crops(meshes: dict[str, Mesh])
         assert (np.abs(cloud - item["center"].numpy()).sum(1) == 0).any()
     assert not (np.abs(cloud - other["center"].numpy()).sum(1) == 0).any()
     assert torch.equal(Crops(meshes, 8, size=64, views=1, pool=2, seed=3)[0, 2]["input"], again["input"])
+
+
+@pytest.mark.slow
+def test_processes_draw_a_pool_once_for_all(folder: Path) -> None:
+    """The same crops as in one process; the clouds lie in memory that is shared, not sent."""
+    options = {"clouds": 4, "pool": 3, "normals": "estimated"}
+    alone, loaded = (data_module(folder, workers=workers, **options) for workers in (0, 2))
+    for data in (alone, loaded):
+        data.setup()
+    pool = loaded.datasets["train"].drawn  # type: ignore[attr-defined]
+    assert isinstance(pool, Pool)
+    assert pool.rows.is_shared()
+    assert alone.datasets["train"].drawn == {}  # type: ignore[attr-defined]
+    assert all(map(torch.equal, inputs(alone), inputs(loaded)))
 
 
 def test_sides_that_are_found_are_those_at_work_and_mostly_true(meshes: dict[str, Mesh]) -> None:
