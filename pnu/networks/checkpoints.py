@@ -172,17 +172,17 @@ def start_from(network: nn.Module, other: nn.Module, source: str | PathLike[str]
     """`fill` with the state of another network, for a training that goes on from it.
 
     Parts that the network says are optional, by the beginning of their names, stay new where the other has none, and
-    are left out where only the other has them. Where it says that weights may be wider than the other's, what these do
-    not have stays new.
+    are left out where only the other has them. So is what weights have beyond the other's, where it says that their
+    width may differ.
     """
     state, own = other.state_dict(), network.state_dict()
-    for name in getattr(network, "wider", ()):
-        less = state.get(name)
-        if less is not None and less.dim() == own[name].dim():
-            inside = tuple(slice(size) for size in less.shape)
-            if own[name][inside].shape == less.shape != own[name].shape:
-                state[name] = own[name].clone()
-                state[name][inside] = less
+    for name in getattr(network, "widths", ()):
+        its, mine = state.get(name), own[name]
+        if its is not None and its.dim() == mine.dim() and its.shape != mine.shape:
+            both = tuple(slice(min(sizes)) for sizes in zip(its.shape, mine.shape, strict=True))
+            if its[both].shape in (its.shape, mine.shape):
+                state[name] = mine.clone()
+                state[name][both] = its[both]
     for part in getattr(network, "optional", ()):
         new = {name: value for name, value in own.items() if name.startswith(part)}
         if not new or not any(name.startswith(part) for name in state):

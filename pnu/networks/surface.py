@@ -122,7 +122,7 @@ class Surface(nn.Module):
     procedure = "surface"
     patch_size = 1024
     optional = ("coarse.",)  # a training may begin with weights that have more or less of these,
-    wider = ("projector.first.weight", "projector.out.weight", "projector.out.bias")  # or with those of fewer messages
+    widths = ("projector.first.weight", "projector.out.weight", "projector.out.bias")  # or of more or fewer messages
 
     def __init__(
         self, ratio: int = 4, neighbors: int = 24, reach: int = 24, width: int = 64, rounds: int = 2,

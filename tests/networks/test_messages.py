@@ -120,8 +120,17 @@ def test_a_training_begins_with_weights_of_fewer_messages() -> None:
     found, expected = (SurfaceProjection(model).with_refined_normals(cloud, 1, Context()) for model in (more, less))
     np.testing.assert_allclose(found[:, :9], expected, atol=1e-6)
     np.testing.assert_allclose(upsampled(more, cloud, 600), upsampled(less, cloud, 600), atol=1e-5)
-    with pytest.raises(ValueError, match="^more: expected the state of Surface with the arguments of its config"):
-        checkpoints.start_from(less, more, "more")
+
+
+def test_a_training_begins_with_weights_of_more_messages() -> None:
+    """Those beyond are told no more: `ablation=surface_estimated` switches them off so."""
+    less, more = network(3), network(8)
+    checkpoints.start_from(less, more, "more")
+    mine, its = less.projector, more.projector
+    assert torch.equal(mine.first.weight, its.first.weight[:, : FEATURES + 3])
+    assert torch.equal(mine.out.weight, its.out.weight[: OUT + 3])
+    with pytest.raises(ValueError, match="^wide: expected the state of Surface with the arguments of its config"):
+        checkpoints.start_from(less, network(8, width=24), "wide")
 
 
 @pytest.mark.parametrize("passes", [0, 1, 2])
