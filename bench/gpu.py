@@ -4,6 +4,8 @@ Parts, in this order; each writes its lines to FOLDER/gpu.md when it is done, so
 happens after it:
 
 - `kernels`: the Triton searches against their slow twins, same neighbors and how many times as fast
+- `surface`: closest points on true meshes beside all pairs of points and triangles, and the training step of the model
+  for clouds without normals
 - `step`: the training step of the paper's size, 20 x 1024 -> 4096, forward, loss, backward, Adam, at each precision and
   as a CUDA graph, and where its time goes
 - `upsample`: shipped models on the GPU beside the CPU
@@ -29,15 +31,20 @@ from torch.profiler import ProfilerActivity
 from torch.profiler import profile as torch_profile
 
 import pnu
-from bench.ops import full_matrix, plain_ball_query, plain_farthest_points
+from bench.ops import full_matrix, plain_ball_query, plain_closest_points, plain_farthest_points
 from bench.step import data, step
 from bench.timing import Row, compare
+from pnu.data import shapes
+from pnu.data.crops import Crops, flattened
+from pnu.data.mesh_scene import MeshScene
 from pnu.fast import accelerate
 from pnu.geometry.neighbor_search import ball_query, gpu_kernels, knn
 from pnu.geometry.sampling import farthest_points
 from pnu.io import atomic_path
 from pnu.losses import CompoundLoss
+from pnu.losses.projection import SurfaceLoss
 from pnu.networks.pnu import PNU
+from pnu.networks.surface import Surface
 from pnu.runtime.provenance import provenance
 from pnu.runtime.threads import processor_count
 
@@ -94,6 +101,46 @@ def kernel_lines(plan: Plan) -> Iterator[str]:
         else:
             same = f"{(found == expected).double().mean():.2%} of the indices the same"
         yield f"- {plan.compare(name, {'pnu': ours, 'full matrices': plain}, rounds=3)}; {same}"
+
+
+def surface_lines(plan: Plan) -> Iterator[str]:
+    """What a training of the surface model asks of a GPU: closest points of meshes, and a whole step."""
+    clouds, views, queries = (1, 2, 12) if plan.small else (16, 12, 72)
+    meshes = {name: shapes.make(name) for name in ("cup", "dice", "knob", "nut")}
+    scene = MeshScene(list(meshes.values()))
+    crops = Crops(meshes, clouds, size=160 if plan.small else 288, views=views, normals="estimated", least=300)
+    batch = flattened([crops[0, index] for index in range(clouds)])
+    batch = {name: value.to(plan.device) if isinstance(value, Tensor) else value for name, value in batch.items()}
+    batch["surface"] = scene
+
+    shape = torch.zeros(1, dtype=torch.int64, device=plan.device)
+    mesh = scene.meshes[0]
+    corners = torch.from_numpy(mesh.vertices[mesh.faces]).float().to(plan.device)
+    points = torch.rand(256, 3, generator=torch.Generator().manual_seed(0)).sub(0.5).to(plan.device)
+
+    def ours() -> Tensor:
+        return scene.closest(points[None], shape)[0][0]
+
+    def plain() -> Tensor:
+        return plain_closest_points(points, corners)
+
+    apart = ((points - ours()).norm(dim=1) - (points - plain()).norm(dim=1)).abs().max()
+    name = f"closest points, {len(points)} on {len(corners)} triangles"
+    row = plan.compare(name, {"pnu": ours, "all pairs": plain}, rounds=3)
+    yield f"- {row}; greatest difference of distances {apart:.1e}"
+
+    torch.manual_seed(0)
+    network = Surface(neighbors=32, reach=48, queries=queries, messages=8, passes=2).to(plan.device)
+    loss, optimizer = SurfaceLoss(), torch.optim.AdamW(network.parameters(), 1e-4, fused=True)
+
+    def one_step() -> None:
+        optimizer.zero_grad()
+        outputs = network.outputs(batch["input"])
+        loss(outputs["prediction"], batch["target"], {**batch, **outputs})["loss"].backward()
+        optimizer.step()
+
+    row = plan.compare("", {"pnu": one_step}, rounds=3)
+    yield f"- training step of the surface model, {clouds * views} crops: {1e3 * row.seconds['pnu']:.1f} ms"
 
 
 def step_lines(plan: Plan) -> Iterator[str]:
@@ -208,6 +255,7 @@ def schedule_lines(plan: Plan) -> Iterator[str]:
 
 PARTS: dict[str, Callable[[Plan], Iterator[str]]] = {
     "kernels": kernel_lines,
+    "surface": surface_lines,
     "step": step_lines,
     "upsample": upsample_lines,
     "schedule": schedule_lines,

@@ -38,6 +38,23 @@ def plain_ball_query(query: Tensor, target: Tensor, radius: float, k: int) -> Te
     return torch.where(found < n, found, found[..., :1] % n)
 
 
+def plain_closest_points(points: Tensor, corners: Tensor) -> Tensor:
+    """Of points (m, 3) on triangles (t, 3, 3), all pairs at once: the nearest of the sides, or the foot within them."""
+    side = corners.roll(-1, 1) - corners
+    normal = torch.linalg.cross(side[:, 0], side[:, 1])
+    normal = normal / normal.norm(dim=-1, keepdim=True).clamp(min=1e-30)
+    away = points[:, None, None] - corners
+    along = ((away * side).sum(-1) / side.square().sum(-1).clamp(min=1e-30)).clamp(0, 1)
+    of_sides = away - along[..., None] * side
+    inside = ((away * torch.linalg.cross(normal[:, None].expand_as(side), side)).sum(-1) >= 0).all(-1)
+    height = (away[:, :, 0] * normal).sum(-1, keepdim=True) * normal
+    nearest = of_sides.norm(dim=-1).argmin(-1)
+    to_side = of_sides.gather(2, nearest[..., None, None].expand(-1, -1, 1, 3))[:, :, 0]
+    step = torch.where(inside[..., None], height, to_side)
+    face = step.norm(dim=-1).argmin(1)
+    return points - step[torch.arange(len(points), device=points.device), face]
+
+
 def open3d_knn(points: np.ndarray, k: int) -> None:
     """Open3D's tensor search, one cloud after the other."""
     import open3d.core as o3c

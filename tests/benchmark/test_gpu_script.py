@@ -18,7 +18,13 @@ def test_every_part_runs_small_on_the_cpu(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     text = (tmp_path / "gpu.md").read_text(encoding="utf-8")
     assert "100.00% of the indices the same" in text
-    for words in ("training step, bfloat16", "upsample 400 -> 1600, surface", "exit code 0", "16 nearest"):
+    for words in (
+        "training step, bfloat16",
+        "upsample 400 -> 1600, surface",
+        "exit code 0",
+        "16 nearest",
+        "2 crops: pnu",
+    ):
         assert words in text
     assert (tmp_path / "run" / "checkpoints" / "last.ckpt").exists()
 
