@@ -35,6 +35,7 @@ class ProjectionDataModule(EpochDataModule):
         points: points of a validation cloud
         workers: processes that draw crops; 0: the training's own
         seed: of all draws
+        quiet: no progress bar while a pool is drawn
     """
 
     kind = "clouds"
@@ -46,6 +47,7 @@ class ProjectionDataModule(EpochDataModule):
         scans: float = 0.0, blue: float = 0.15, least: int = LEAST,
         noise: float = 0.02, noisy: float = 0.5, given: float = 0.3, clouds: int = 6400, pool: int | None = None,
         size: int = 384, views: int = 2, batch_size: int = 8, points: int = 2048, workers: int = 0, seed: int = 0,
+        quiet: bool = False,
     ) -> None:  # fmt: skip
         super().__init__(batch_size, workers, seed)
         if points < SMALLEST:
@@ -55,6 +57,7 @@ class ProjectionDataModule(EpochDataModule):
         self.scans, self.blue, self.least, self.noise, self.noisy = scans, blue, least, noise, noisy
         self.sides, self.given, self.pool = sides, given, pool
         self.normals, self.clouds, self.size, self.views, self.points = normals, clouds, size, views, points
+        self.quiet = quiet
         self.truth: MeshScene | None = None
 
     @property
@@ -96,7 +99,7 @@ class ProjectionDataModule(EpochDataModule):
             seed=self.seed,
         )
         if self.pool is not None and self.workers > 1:
-            train.draw_pool(self.workers)
+            train.draw_pool(self.workers, quiet=self.quiet)
         clouds = {
             part: WholeClouds(held_out, self.points, normals=self.normals, sides=self.sides, seed=seed)
             for part, seed in (("val", 1), ("test", 2))

@@ -131,15 +131,15 @@ class Crops(Dataset[dict[str, Any]]):
         """A cloud of the pool, drawn."""
         return self.draw(np.random.default_rng((self.seed, number)))
 
-    def draw_pool(self, workers: int) -> None:
+    def draw_pool(self, workers: int, *, quiet: bool = False) -> None:
         """Draw the clouds of the pool by so many processes, for all that draw crops from them: else each of these
-        draws all that it uses."""
+        draws all that it uses. quiet: without a bar."""
         assert self.pool is not None
         # spawned workers: a fork of a process with threads may hang
         drawn = DataLoader(
             PooledClouds(self), batch_size=None, num_workers=workers, multiprocessing_context="spawn", collate_fn=as_is
         )
-        self.drawn = Pool(list(counted(drawn, self.pool, "clouds")))
+        self.drawn = Pool(list(drawn if quiet else counted(drawn, self.pool, "draw the pool of clouds")))
 
     def draw(self, rng: np.random.Generator) -> Drawn:
         """A cloud of one of the meshes."""

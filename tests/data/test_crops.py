@@ -123,12 +123,13 @@ def test_clouds_of_a_pool_are_used_again_in_other_crops(meshes: dict[str, Mesh])
 
 
 @pytest.mark.slow
-def test_processes_draw_a_pool_once_for_all(folder: Path) -> None:
+def test_processes_draw_a_pool_once_for_all(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The same crops as in one process; the clouds lie in memory that is shared, not sent."""
     options = {"clouds": 4, "pool": 3, "normals": "estimated"}
-    alone, loaded = (data_module(folder, workers=workers, **options) for workers in (0, 2))
-    for data in (alone, loaded):
+    alone, silent, loaded = (data_module(folder, workers=w, quiet=q, **options) for w, q in ((0, 0), (2, 1), (2, 0)))
+    for data, shown in ((alone, False), (silent, False), (loaded, True)):
         data.setup()
+        assert ("draw the pool of clouds" in capsys.readouterr().err) == shown
     pool = loaded.datasets["train"].drawn  # type: ignore[attr-defined]
     assert isinstance(pool, Pool)
     assert pool.rows.is_shared()
