@@ -107,8 +107,8 @@ def print_tables(rows: Sequence[Row], head: str, metrics: Sequence[Metric] = MET
         of_kind = [row for row in rows if row["kind"] == kind]
         all_shown = columns(of_kind, metrics)
         table = Table(title=f"{kind}: {counts(of_kind)}", title_justify="left", title_style="bold")
-        for head in ("method", "shape"):
-            table.add_column(head, overflow="fold")
+        for name in ("method", "shape"):
+            table.add_column(name, overflow="fold")
         for shown in all_shown:
             table.add_column(shown.head or shown.title, justify="right")
         for summary in sorted((s for s in summaries if s["kind"] == kind), key=lambda s: s["method"] in REFERENCES):

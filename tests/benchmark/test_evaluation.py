@@ -247,8 +247,9 @@ def test_names_are_not_cut_in_tables_of_many_columns(capsys: pytest.CaptureFixtu
     shown = capsys.readouterr().out
     assert all(f" {name} " in shown for name in names)
     points = {"points_in": 1, "points_out": 4, "frame": "truth"}
-    benchmark.print_tables([row | points for row in rows], "head")
+    benchmark.print_tables([row | points for row in rows], "what was measured, and by which revision.")
     shown = capsys.readouterr().out
+    assert "\nwhat was measured, and by which revision. CD: " in shown
     assert all(f" {row['shape']} " in shown and row["method"] in shown for row in rows)
 
 
@@ -464,8 +465,9 @@ def test_command_with_a_run(place: Path, capsys: pytest.CaptureFixture[str]) -> 
     out = capsys.readouterr().out
     folder = place / "outputs" / "small" / "evaluation" / "synthetic"
     assert "random: 256 -> 512 points" in out
-    assert "normals of the input estimated. " in out
-    assert "CD: mean squared distances" in " ".join(out.split())
+    words = " ".join(out.split())  # lines are as wide as the terminal
+    assert "outputs/small, normals of the input estimated. " in words
+    assert "CD: mean squared distances" in words
     assert "output: outputs/small/evaluation/synthetic/metrics.json" in out
     assert out.endswith("next:   pnu compare 'methods=[outputs/small,apss]'\n")
     found = read_json(folder / "metrics.json")

@@ -23,7 +23,7 @@ def test_every_part_runs_small_on_the_cpu(tmp_path: Path) -> None:
         "upsample 400 -> 1600, surface",
         "exit code 0",
         "16 nearest",
-        "2 crops: pnu",
+        "surface model, 2 crops",
     ):
         assert words in text
     assert (tmp_path / "run" / "checkpoints" / "last.ckpt").exists()
