@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
-from torch import Tensor
+from torch import Tensor, nn
 
 from pnu.data.shapes import make, unit_mesh
 from pnu.geometry.even_spacing import repel, tangent_discs
@@ -15,7 +15,7 @@ from pnu.geometry.mesh_sampling import sample_poisson_disk
 from pnu.geometry.spacing import spacing
 from pnu.geometry.transforms import rotation_matrix
 from pnu.metrics.functional import uniformity
-from pnu.networks.surface import Projector, Surface
+from pnu.networks.surface import Projector, Surface, discs_of_patches
 from pnu.upsamplers import Context, SurfaceProjection
 from pnu.upsamplers import surface_projection as procedure
 from pnu.upsamplers.surface_projection import no_farther, reject_worst, slid, within_reach
@@ -397,6 +397,18 @@ def test_along_the_surface_points_go_a_share_of_the_way() -> None:
     np.testing.assert_allclose(slid(query, refined, 0), [[2.2, 1, 2.6, *normal]], atol=1e-15)
     with pytest.raises(ValueError, match=r"model\.slide=1\.1: expected a share from 0 to 1"):
         Surface(slide=1.1)
+
+
+@pytest.mark.parametrize("n", [5, 90])
+def test_seeds_laid_at_once_are_those_laid_patch_by_patch(n: int) -> None:
+    """As on a GPU; few points too, and a nearest neighbor straight above its point."""
+    generator = torch.Generator().manual_seed(1)
+    patch = torch.cat([torch.randn(3, n, 3, generator=generator), torch.randn(3, n, 3, generator=generator)], -1)
+    patch[..., 3:] = nn.functional.normalize(patch[..., 3:], dim=-1)
+    patch[0, 1, :3] = patch[0, 0, :3] + 1e-3 * patch[0, 0, 3:]
+    found = discs_of_patches(patch, 3, first=4)
+    for discs, one in zip(found.numpy(), patch.numpy(), strict=True):
+        np.testing.assert_allclose(discs, tangent_discs(one[:, :3], one[:, 3:], 3, first=4), atol=2e-5)
 
 
 def test_training_seeds_are_spread_and_pushed_outward() -> None:
