@@ -1,5 +1,6 @@
 """What is done to a cloud before it becomes denser, and said: strays taken out, lines thinned, normals turned."""
 
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ from pnu.cleaning.outliers import MANY, stray_points
 from pnu.geometry.anisotropy import averaged, thinned_lines
 from pnu.geometry.cloud_normals import Settled, camera_sight, camera_words, contradiction, settled_normals
 from pnu.geometry.noise_level import noise_level
+from pnu.geometry.normal_estimation import normals_on_sides
 from pnu.geometry.single_view import camera_place
 from pnu.geometry.spacing import spacing
 from pnu.io import Cloud
@@ -18,13 +20,25 @@ from pnu.io.sensor import Sight
 
 Treatment = Literal["auto", "keep"]
 TREATMENTS = ("auto", "keep")
+Doubts = Callable[[NDArray[np.float64], NDArray[np.float64]], str]
+"""Points (n, 3), unit normals (n, 3) whose sides agree -> why their axes are better found anew; empty: they are not."""
 Character = Literal["clean", "scanned", "noisy"]
 """What a cloud is like: clean and scanned ones show little noise, scanned ones lie in lines or have many strays."""
 NOISY = 0.17  # spacings of noise from which on a cloud is noisy; then what looks stray says nothing of scans
 MANY_ENOUGH = 1000  # points that tell noise from what they do not resolve
 MANY_TO_SMOOTH = 4000  # points of which the 64 neighbors of the weights for noise are a small place
 
-__all__ = ["TREATMENTS", "Character", "Cleaned", "Treatment", "clean_cloud", "is_noisy", "stray_points"]
+__all__ = [
+    "TREATMENTS",
+    "Character",
+    "Cleaned",
+    "Doubts",
+    "Treatment",
+    "clean_cloud",
+    "is_noisy",
+    "stray_points",
+    "with_axes_anew",
+]
 
 
 class Cleaned(NamedTuple):
@@ -44,8 +58,9 @@ class Cleaned(NamedTuple):
 
 
 def clean_cloud(
-    cloud: Cloud, *, outliers: Treatment = "auto", lines: Treatment = "auto", signs: Treatment = "auto"
-) -> Cleaned:
+    cloud: Cloud, *, outliers: Treatment = "auto", lines: Treatment = "auto", signs: Treatment = "auto",
+    doubts: Doubts | None = None,
+) -> Cleaned:  # fmt: skip
     """A cloud without stray points (`outliers`), with lines thinned out (`lines`) and normals that agree (`signs`).
 
     Lines are found where points are several times as dense along one direction as across it. As many points stay as lie
@@ -57,6 +72,7 @@ def clean_cloud(
         outliers: auto: stray points are taken out; keep: all stay.
         lines: auto: thinned out; keep: as they are.
         signs: auto: of normals that contradict each other the axes are kept and the sides chosen anew; keep: as given.
+        doubts: says, where signs are auto, of which normals the sides alone count (`with_axes_anew`); None: of none.
 
     Raises:
         ValueError: a treatment is neither auto nor keep, or hardly a point is none of the stray ones.
@@ -71,26 +87,44 @@ def clean_cloud(
         how = "they lie off the surface" if camera is None else f"torn off at edges, as a {camera_words(camera)} saw"
         notes.append(f"{len(stray)} of {len(cloud.points)} points left out: stray, {how} (outliers=keep)")
         cloud = chosen(cloud, np.setdiff1d(np.arange(len(cloud.points)), stray))
-    rows = thinned_lines(cloud.points) if lines == "auto" and cloud.normals is None else None
-    if rows is not None:
-        notes.append(
-            f"lies in lines: {len(rows)} points, less dense along them, stand for {len(cloud.points)} (lines=keep)"
-        )
-        cloud = chosen(cloud, rows)._replace(points=averaged(cloud.points, rows))
     if signs == "auto" and cloud.normals is not None and contradiction(cloud.points, cloud.normals):
         settled = settled_normals(cloud.points, cloud.normals, scans=scan_numbers(cloud.attributes))
         notes.append(f"normals: {settled.words} (normals=keep)")
         cloud = cloud._replace(normals=settled.normals)
-    share = len(stray) / (len(stray) + len(cloud.points))
     found = Cleaned(cloud._replace(notes=tuple(notes)), stray, camera=camera)
-    if cloud.normals is not None:
-        return found
-    scanned = found._replace(character="scanned" if share > MANY or camera is not None else "clean")
+    if cloud.normals is None:
+        return _with_character(found, lines)
+    why = "" if doubts is None or signs == "keep" else doubts(cloud.points, cloud.normals)
+    return with_axes_anew(found, why, lines=lines) if why else found
+
+
+def with_axes_anew(found: Cleaned, why: str, *, lines: Treatment = "auto") -> Cleaned:
+    """A clean cloud whose normals are taken for their sides alone: as one without, but that their sides are known."""
+    assert found.cloud.normals is not None
+    count = int(np.isfinite(found.cloud.normals).all(1).sum())
+    note = (
+        f"normals: of {count} given the sides alone are taken, their axes are found anew, they are {why} (normals=keep)"
+    )
+    found = found._replace(cloud=found.cloud._replace(notes=(*found.cloud.notes, note)))
+    return _with_character(found, lines)
+
+
+def _with_character(found: Cleaned, lines: Treatment) -> Cleaned:
+    """A cloud without normals, or with such as tell the sides alone, with lines thinned out: what it is like."""
+    cloud, notes = found.cloud, found.cloud.notes
+    rows = thinned_lines(cloud.points) if lines == "auto" else None
+    if rows is not None:
+        note = f"lies in lines: {len(rows)} points, less dense along them, stand for {len(cloud.points)} (lines=keep)"
+        cloud = chosen(cloud, rows)._replace(points=averaged(cloud.points, rows), notes=(*notes, note))
+    share = len(found.stray) / (len(found.stray) + len(cloud.points))
+    known = None if cloud.normals is None else Settled(normals_on_sides(cloud.points, cloud.normals), "", "")
+    found = found._replace(cloud=cloud._replace(normals=None), estimated=known)
+    scanned = found._replace(character="scanned" if share > MANY or found.camera is not None else "clean")
     if rows is not None:
         return scanned._replace(character="scanned")
     if not is_noisy(cloud.points):  # nor has it thin walls, whose sides normals tell apart
         return scanned
-    estimated = settled_normals(cloud.points, None, found=found.sight, scans=scan_numbers(cloud.attributes))
+    estimated = known or settled_normals(cloud.points, None, found=found.sight, scans=scan_numbers(cloud.attributes))
     if is_noisy(cloud.points, estimated.normals):
         return found._replace(character=noisy_character(cloud.points), estimated=estimated)
     return scanned._replace(estimated=estimated)

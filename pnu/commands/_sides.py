@@ -61,19 +61,22 @@ def with_normals(cloud: "Cloud", settled: "Settled") -> "Cloud":
     return cloud._replace(normals=settled.normals, notes=notes)
 
 
-def cleaned(cfg: Any, cloud: "Cloud", **treatments: Any) -> tuple["Cleaned", "Cloud"]:
+def cleaned(cfg: Any, cloud: "Cloud", *, outliers: Any = "auto", lines: Any = "auto") -> tuple["Cleaned", "Cloud"]:
     """A cloud as `clean_cloud` leaves it, and the same with a normal for each point, its own or rough estimates.
 
-    Where keys or file say more of the side of normals than the shape of the cloud does, they decide it.
+    Where keys or file say more of the side of normals than the shape of the cloud does, they decide it. With
+    normals=auto the axes of poor ones are found anew.
     """
-    from pnu.cleaning import clean_cloud
+    from pnu.cleaning import clean_cloud, with_axes_anew
     from pnu.geometry.cloud_normals import sight_by_places
     from pnu.io.sensor import asked_sight, sight_of
+    from pnu.upsamplers.poor_axes import poor_axes
 
     told = asked_sight(cfg.viewpoint, cfg.up, cfg.side) is not None or cfg.normals == "orient"
     places = sight_by_places(cloud.points)
     told = told or sight_of(cfg.input, cloud.attributes) is not None or places is not None
-    found = clean_cloud(cloud, **treatments, signs="keep" if told or cfg.normals == "keep" else "auto")
+    signs: Any = "keep" if told or cfg.normals == "keep" else "auto"
+    found = clean_cloud(cloud, outliers=outliers, lines=lines, signs=signs, doubts=poor_axes)
     own = found.cloud.normals is not None
     if own and not told:
         return found, found.cloud
@@ -81,4 +84,12 @@ def cleaned(cfg: Any, cloud: "Cloud", **treatments: Any) -> tuple["Cleaned", "Cl
     settled = settled or sided(cfg, found.cloud, learned=False, places=places)
     whole = with_normals(found.cloud, settled)
     found = found._replace(seen=settled.seen)
-    return (found._replace(cloud=whole) if own else found._replace(estimated=settled)), whole
+    if not own:
+        return found._replace(estimated=settled), whole
+    found = found._replace(cloud=whole)
+    why = poor_axes(whole.points, settled.normals) if cfg.normals == "auto" else ""
+    if not why:
+        return found, whole
+    found = with_axes_anew(found, why, lines=lines)
+    assert found.estimated is not None
+    return found, found.cloud._replace(normals=found.estimated.normals)

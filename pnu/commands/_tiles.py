@@ -102,6 +102,8 @@ def upsample_in_tiles(cfg: Any, say: Say) -> None:
         say(f"        lies in lines: thinned out to {facts.lined:.3g} between points (lines=keep)")
     if facts.turned:
         say(f"        normals: sides chosen anew, {facts.turned} (normals=keep)")
+    if facts.poor:
+        say(f"        normals: axes found anew, they are {facts.poor} (normals=keep)")
     run = tile_work.run_of(plan)
     say(f"run:    {run}")
     most = max(facts.sizes)

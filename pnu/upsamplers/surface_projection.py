@@ -41,7 +41,9 @@ CloudT = TypeVar("CloudT", "Floats", "Tensor")
 
 EVEN = 0.3  # standard deviation over mean of the nearest distance; 0.52 at random
 STILL_EVEN = 0.4  # so much where points were smoothed
-MOVED = 2.0  # smoothing moves points by so many times the noise at most, lest tips are drawn to the rest
+MOVED = 2.0  # smoothing moves points by so many times the noise at most, lest tips are drawn to the rest,
+MOVED_ALONG = 3.0  # where it moves them along given normals
+ROUNDS, ROUNDS_ALONG = 2, 8  # of smoothing
 KEPT = 2**18  # queries whose projections are kept in one file
 BATCH = 512  # queries at once on a CPU,
 BATCHES = 32  # of which its threads share so many
@@ -161,16 +163,26 @@ class SurfaceProjection:
         return in_parts(project, query, cloud, workers=workers, context=context, stage=stage)
 
     def smoothed(self, cloud: Floats, context: Context) -> Floats:
-        """A noisy cloud (n, 6 + messages) with its points projected, and normals found anew if the network finds them.
+        """A noisy cloud (n, 6 + messages) with its points projected, a few times: each time less noise is seen.
 
-        None moves farther than noise may have moved it: a lone point at a tip is not drawn to the others.
+        None moves farther than noise may have moved it: a lone point at a tip is not drawn to the others. If the
+        network finds normals they are found anew. Given ones stay, as they tell more of the surface than noisy points
+        do, and points move along them alone.
         """
-        smooth, _ = self._found(cloud[:, :6], cloud, context, "smoothing, the points are noisy", projections)
-        limit = MOVED * noise_level(cloud[:, :3], cloud[:, 3:6])
-        smooth[:, :3] = no_farther(limit, cloud[:, :3], smooth[:, :3])
-        if not self.network.passes:
-            return smooth
-        return self._anew(smooth, context, "normals of the smooth points")
+        anew = self.network.passes > 0
+        limit = (MOVED if anew else MOVED_ALONG) * noise_level(cloud[:, :3], cloud[:, 3:6])
+        smooth = cloud
+        for number in range(1, (ROUNDS if anew else ROUNDS_ALONG) + 1):
+            which = f" {number}" if number > 1 else ""
+            stage = f"smoothing{which}, the points are noisy"
+            moved, _ = self._found(smooth[:, :6], smooth, context, stage, projections)
+            if not anew:
+                moved = slid(smooth[:, :6], np.hstack([moved[:, :3], smooth[:, 3:6]]), 0)
+            smooth = np.hstack([no_farther(limit, cloud[:, :3], moved[:, :3]), smooth[:, 3:]])
+            if anew:
+                smooth[:, 3:] = moved[:, 3:]
+                smooth = self._anew(smooth, context, f"normals of the smooth points{which and ','}{which}")
+        return smooth
 
     def with_refined_normals(self, cloud: Floats, passes: int, context: Context) -> Floats:
         """A cloud (n, 6) with the normals that the network finds at its points, so many times one after the other, and

@@ -37,6 +37,7 @@ from pnu.io.point_stream import in_range, is_geographic, point_slices
 from pnu.io.scan_columns import scan_numbers
 from pnu.io.sensor import Sight, asked_sight, sight_of
 from pnu.runtime.progress import Progress, silent
+from pnu.upsamplers.poor_axes import poor_axes
 from pnu.upsamplers.surface_projection import is_even, noise_in_spacings
 
 SAMPLE = 2**18  # points that say where tiles are cut,
@@ -92,10 +93,17 @@ class Facts:
     character: Character = "clean"
     turned: str = ""
     """Why the sides of given normals are chosen anew; empty: they are not."""
+    poor: str = ""
+    """Why the axes of given normals are found anew; empty: they are not."""
     heights: bool = False
     """Whether this is a map of heights, seen from above."""
     apart: float = 0.0
     """Spacing where a tenth of the points lie farther apart, after thinning."""
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the axes of given normals are used."""
+        return self.given and not self.poor
 
     @property
     def margin(self) -> float:
@@ -372,7 +380,9 @@ def _decided(folder: Path, keys: Keys, facts: Facts, progress: Progress) -> None
         values = np.array([look[name] for look in found if look[name] is not None])
         return float(np.median(values)) if len(values) else 0.0
 
-    if most("lined") and keys.lines == "auto" and keys.keep is not True and not facts.given:
+    if facts.given and keys.normals == "auto" and most("poor"):
+        facts.poor = next(look["poor"] for look in found if look["poor"])
+    if most("lined") and keys.lines == "auto" and keys.keep is not True and not facts.trusted:
         facts.lined = middle("lined")
     facts.apart = max(look["apart"] if facts.lined else look["apart_raw"] for look in found)
     facts.smooth = most("noisy")
@@ -380,7 +390,7 @@ def _decided(folder: Path, keys: Keys, facts: Facts, progress: Progress) -> None
     stray = float(weight @ np.array([look["stray"] for look in found])) / weight.sum()
     if facts.lined is not None:
         facts.character = "scanned"
-    elif not facts.given:
+    elif not facts.trusted:
         facts.character = "noisy" if most("loud") else "scanned" if stray > MANY else "clean"
     facts.keep = keys.keep if isinstance(keys.keep, bool) else most("even")
     if facts.given and keys.normals == "auto" and most("turned"):
@@ -404,13 +414,15 @@ def _look(points: np.ndarray, normals: np.ndarray | None, keys: Keys, size: int)
     points, normals = points[~stray], None if normals is None else normals[~stray]
     look["apart_raw"] = float(np.quantile(local_spacing(points), 0.9))
     look["turned"] = "" if normals is None else contradiction(points, normals)
-    thinned = thinned_lines(points) if normals is None else None
+    known = None if normals is None else settled_normals(points, normals).normals
+    look["poor"] = "" if known is None else poor_axes(points, known)
+    thinned = thinned_lines(points) if known is None or look["poor"] else None
     look["lined"] = None
     if thinned is not None:
-        points = points[thinned]
+        points, known = points[thinned], None if known is None else known[thinned]
         look["lined"] = float(np.quantile(PointTree(points).among_themselves(2)[0][:, 0], 0.02))
     look["apart"] = float(np.quantile(local_spacing(points), 0.9))
-    known = settled_normals(points, normals).normals
+    known = settled_normals(points, None).normals if known is None else known
     scale = np.abs(points - points.mean(0)).max()
     cloud = np.hstack([(points - points.mean(0)) / scale, known])
     look["noisy"] = noise_in_spacings(cloud) > FAINT

@@ -19,7 +19,7 @@ from pnu.cleaning import stray_points
 from pnu.geometry.anisotropy import averaged
 from pnu.geometry.even_spacing import RANK, tangent_discs
 from pnu.geometry.farthest_sampling import farthest_apart, farthest_order, single_precision
-from pnu.geometry.normal_estimation import complete_normals
+from pnu.geometry.normal_estimation import complete_normals, normals_on_sides
 from pnu.geometry.normal_sides import seen_signs, voted_signs
 from pnu.geometry.point_tree import PointTree
 from pnu.geometry.unit_sphere import Frame, unit_sphere_frame
@@ -49,7 +49,7 @@ Known = Callable[[NDArray[np.float64]], NDArray[np.bool_]]
 
 def run_of(plan: Plan) -> str:
     """The weights for all tiles of a plan."""
-    none_given = None if not plan.facts.given else np.empty((0, 3))
+    none_given = None if not plan.facts.trusted else np.empty((0, 3))
     return str(weights_source(plan.keys.run, none_given, plan.facts.character))
 
 
@@ -112,6 +112,8 @@ def prepared(plan: Plan, number: int) -> None:
         normals = np.broadcast_to([0.0, 0.0, 1.0], (len(rows), 3))
     else:
         normals = _normals(plan, rows)
+        if facts.poor:
+            normals = normals_on_sides(points, normals)
     attributes = attributes_of(rows)
     inside = plan.cells.inside(points, number)
     share = Share(int(inside.sum()), 0.0, [], 0.0, spread, strays)
@@ -298,7 +300,7 @@ def made(plan: Plan, number: int, whole: Whole, upsampler: SurfaceProjection, pr
         dense = frame.from_unit(with_unit_normals(raw, smooth))
         if facts.keep:
             dense[: len(group), :3] = rows["point"][group]
-            if facts.given:
+            if facts.trusted:
                 dense[: len(group), 3:] = rows["normal"][group]
             kept += int(plan.cells.inside(rows["point"][group], number).sum())
             found.insert(0, dense[: len(group)])

@@ -35,6 +35,7 @@ from pnu.upsamplers.context import Context, Merge, Upsampler
 from pnu.upsamplers.density import DENSITIES, Density, count_of_spacing
 from pnu.upsamplers.inference import LoadedWeights, inferring, modules_of, on_device
 from pnu.upsamplers.learned_normals import learned_normals
+from pnu.upsamplers.poor_axes import poor_axes
 from pnu.upsamplers.selection import upsampler_of
 from pnu.upsamplers.surface_projection import SurfaceProjection, is_even, noise_in_spacings
 from pnu.upsamplers.unit_normals import with_unit_normals
@@ -153,8 +154,9 @@ def upsample(
             spread and show no noise.
         outliers: "auto": stray points are taken out first, and not counted less for it: n stays; "keep": none is.
         lines: "auto": scan lines, dense along and sparse across, are thinned out first; "keep": they stay.
-        signs: "auto": where given normals contradict each other, their axes are kept and their sides chosen anew;
-            "keep": they are taken as they are.
+        signs: "auto": where given normals contradict each other, their axes are kept and their sides chosen anew; where
+            they are poor, as planes fitted to neighbors are, their sides are kept and their axes found anew; "keep":
+            they are taken as they are.
         holes: radius, in the unit of the points, up to which holes are filled, by points beyond round(ratio n) that
             continue the surface smoothly (`pnu.reconstruction.fill_holes`); None: none is.
         device: "auto" (where the given network is; else CUDA where there is one), "cpu", "cuda", "cuda:1" ...
@@ -190,7 +192,8 @@ def upsample(
     given = check_cloud(Cloud(*_taken(points, normals, kind, expected, (3, 6))), "points", minimum=MINIMUM)
     count = output_count(len(given.points), ratio if spacing is None else ratio_of_spacing(given.points, spacing))
     options = Densification(patch_size, merge, density, keep, holes, devices, batch_size, seed)
-    cleaned = clean_cloud(given, outliers=outliers, lines="keep" if keep is True else lines, signs=signs)
+    lines = "keep" if keep is True else lines
+    cleaned = clean_cloud(given, outliers=outliers, lines=lines, signs=signs, doubts=poor_axes)
     found = densified(cleaned, count, options, model=model, device=device, progress=progress, parts=parts)
     given = cleaned.cloud
     if kind is not None:

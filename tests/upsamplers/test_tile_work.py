@@ -9,6 +9,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from bench.scenes import scanned_room
+from pnu.data import shapes
+from pnu.geometry.mesh_sampling import sample_area
+from pnu.geometry.normal_estimation import estimate_normals
 from pnu.io import read_cloud, write_cloud
 from pnu.upsamplers import tile_seams, tile_work
 from pnu.upsamplers.tile_plan import Keys, Plan, planned
@@ -139,7 +142,9 @@ def test_a_coarse_cloud_looks_to_the_scanner_that_the_whole_tells(
 
 
 def test_given_normals_and_points_stay(tmp_path: Path) -> None:
-    points, normals = sheet(500), np.tile([0.0, 0.0, -1.0], (500, 1))
+    points = sheet(500)
+    normals = np.column_stack([np.cos(points[:, 0] / 9) / 9, -np.sin(points[:, 1] / 7) / 7, np.full(500, -1.0)])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     normals[::50] = 0
     plan = plan_of(tmp_path / "a", points, 130, normals, keep=True, ratio=2)
     assert plan.facts.missing == 10
@@ -149,7 +154,27 @@ def test_given_normals_and_points_stay(tmp_path: Path) -> None:
     distance, row = cKDTree(dense[:, :3]).query(points)
     assert (distance == 0).all()
     given = np.arange(500) % 50 > 0
-    np.testing.assert_array_equal(dense[row[given], 3:], normals[given])
+    np.testing.assert_allclose(dense[row[given], 3:], normals[given], rtol=0, atol=1e-15)
+
+
+@pytest.mark.slow
+def test_of_poor_normals_the_sides_alone_count(tmp_path: Path) -> None:
+    """As without tiles: the network for clouds without normals, and the sides that are given."""
+    points = sample_area(shapes.make("bracket"), 1500, np.random.default_rng(0))
+    points, normals = points[:, :3], points[:, 3:]
+    planes = estimate_normals(points, orient=False)
+    inward = np.where((planes * normals).sum(1, keepdims=True) > 0, -planes, planes)
+    plan = plan_of(tmp_path / "a", points, 600, inward, ratio=2)
+    assert "planes" in plan.facts.poor
+    assert tile_work.run_of(plan) == "surface_estimated"
+    dense = make(plan)
+    assert len(dense) == 3000
+    near = cKDTree(points).query(dense[:, :3])[1]
+    assert ((dense[:, 3:] * normals[near]).sum(1) < 0).mean() > 0.95
+    keys = KEYS._replace(input=str(tmp_path / "a" / "cloud.npy"), normals="keep")
+    believed = planned(tmp_path / "a", keys, 600)
+    assert not believed.facts.poor
+    assert tile_work.run_of(believed) == "surface"
 
 
 @pytest.mark.slow

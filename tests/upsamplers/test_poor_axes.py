@@ -1,0 +1,145 @@
+"""Given normals that are worse than what is found at work: of these the sides alone count."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+import pnu
+from pnu.commands.upsample import main as upsample_main
+from pnu.data import shapes
+from pnu.geometry.mesh_sampling import closest_points, sample_area, sample_poisson_disk
+from pnu.geometry.normal_estimation import estimate_normals
+from pnu.io import write_cloud
+from pnu.upsamplers.poor_axes import poor_axes
+
+Array = np.ndarray
+MESH = shapes.make("bracket")
+PLANES = "no better than planes fitted to neighbors"
+
+
+def cloud(name: str = "bracket", n: int = 1200, noise: float = 0.0) -> tuple[Array, Array]:
+    rng = np.random.default_rng(0)
+    found = sample_area(shapes.make(name), n, rng)
+    return found[:, :3] + noise * rng.standard_normal((n, 3)), found[:, 3:]
+
+
+def on_side(axes: Array, normals: Array) -> Array:
+    return np.where((axes * normals).sum(1, keepdims=True) < 0, -axes, axes)
+
+
+def fitted(points: Array, normals: Array, k: int = 16) -> Array:
+    return on_side(estimate_normals(points, k, orient=False), normals)
+
+
+def fitted_within(points: Array, normals: Array, radius: float) -> Array:
+    """Of all neighbors within a radius, as many programs fit them."""
+    axes = []
+    for around in cKDTree(points).query_ball_point(points, radius):
+        near = points[around] - points[around].mean(0)
+        axes.append(np.linalg.eigh(near.T @ near)[1][:, 0])
+    return on_side(np.array(axes), normals)
+
+
+def tilted(normals: Array, degrees: float) -> Array:
+    rng = np.random.default_rng(1)
+    found = normals + np.radians(degrees) * rng.standard_normal(normals.shape)
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+def degrees(dense: Array) -> float:
+    """Mean angle to the normals of the true faces."""
+    faces = closest_points(MESH, dense[:, :3])[2]
+    corners = MESH.vertices[MESH.faces[faces]]
+    true = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    true /= np.linalg.norm(true, axis=1, keepdims=True)
+    return float(np.degrees(np.arccos(np.abs((dense[:, 3:] * true).sum(1)).clip(0, 1))).mean())
+
+
+def off(dense: Array) -> float:
+    """Mean distance from the true surface."""
+    return float(closest_points(MESH, dense[:, :3])[1].mean())
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.004, 0.01])
+@pytest.mark.parametrize("name", ["bracket", "mug", "head"])
+def test_true_normals_are_good(name: str, noise: float) -> None:
+    points, normals = cloud(name, noise=noise)
+    assert poor_axes(points, normals) == ""
+    assert poor_axes(points, tilted(normals, 2)) == ""
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.004])
+def test_plane_fits_are_poor_whatever_their_neighbors(noise: float) -> None:
+    points, normals = cloud(noise=noise)
+    for k in (8, 10, 16, 30, 50):
+        assert poor_axes(points, fitted(points, normals, k)) == PLANES
+    apart = float(np.median(cKDTree(points).query(points, 2)[0][:, 1]))
+    for radius in (4, 6):
+        assert poor_axes(points, fitted_within(points, normals, radius * apart)) == PLANES
+
+
+def test_rough_ones_are_poor() -> None:
+    points, normals = cloud()
+    for much in (12, 20):
+        assert poor_axes(points, tilted(normals, much)) == "rough"
+
+
+def test_neither_order_nor_place_rotation_and_size_nor_some_that_are_missing_have_an_influence() -> None:
+    points, normals = cloud()
+    order = np.random.default_rng(2).permutation(len(points))
+    turn = Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix()
+    for axes, why in ((normals, ""), (fitted(points, normals), PLANES), (tilted(normals, 20), "rough")):
+        assert poor_axes(points, axes) == why
+        assert poor_axes(points[order], axes[order]) == why
+        assert poor_axes(100 * points @ turn.T + [5e5, 5e6, 300], axes @ turn.T) == why
+        some = axes.copy()
+        some[::7] = np.nan
+        assert poor_axes(points, some) == why
+    assert poor_axes(points[:40], fitted(points, normals)[:40]) == ""  # too few to judge
+    assert poor_axes(points, np.full_like(points, np.nan)) == ""
+
+
+def test_of_poor_ones_the_sides_alone_count() -> None:
+    """Bare points give as much; before, plane fits were believed, and what was made of them lay twice as far off."""
+    points, normals = cloud(n=800)
+    given = fitted(points, normals)
+    believed, bare = pnu.upsample(points, given, ratio=2, signs="keep"), pnu.upsample(points, ratio=2)
+    dense = pnu.upsample(points, given, ratio=2)
+    assert off(dense) < 0.6 * off(believed)
+    assert degrees(dense) < 0.8 * degrees(believed)
+    assert off(dense) < 1.1 * off(bare)
+    inward = pnu.upsample(points, -given, ratio=2)
+    assert off(inward) < 1.3 * off(dense)  # the network knows the outside better
+    near = cKDTree(points).query(inward[:, :3])[1]
+    assert ((inward[:, 3:] * normals[near]).sum(1) < 0).mean() > 0.95
+
+
+def test_rough_ones_do_no_harm() -> None:
+    points, normals = cloud()
+    given = tilted(normals, 15)
+    assert off(pnu.upsample(points, given)) < 0.8 * off(pnu.upsample(points, given, signs="keep"))
+
+
+def test_true_ones_are_used() -> None:
+    points, normals = cloud()
+    np.testing.assert_array_equal(pnu.upsample(points, normals), pnu.upsample(points, normals, signs="keep"))
+
+
+def test_the_command_says_so_and_can_be_told_otherwise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = sample_poisson_disk(MESH, 600, np.random.default_rng(0))
+    points, normals = found[:, :3], found[:, 3:]
+    path, dense = tmp_path / "scan.ply", tmp_path / "dense.ply"
+    write_cloud(path, points, fitted(points, normals))
+    said = f"of 600 given the sides alone are taken, their axes are found anew, they are {PLANES}"
+    for keys, anew, run in (
+        ([], True, "_estimated"),
+        (["viewpoint=0,0,9"], True, "_estimated"),
+        (["normals=keep"], False, ""),
+    ):
+        upsample_main([f"input={path}", f"output={dense}", "quiet=false", *keys])
+        text = capsys.readouterr().out
+        assert (said in text) == anew, text
+        assert f"run:    surface{run} " in text
