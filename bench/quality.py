@@ -33,7 +33,8 @@ class Setting(NamedTuple):
     """What is made of an input: some of its points at random, Gaussian noise in units of the radius, the ratio."""
 
     title: str
-    given: bool = False  # with the normals of the file
+    given: bool = False  # with the normals of the file,
+    planes: int = 0  # or with those of planes fitted to so many neighbors, on the right side, as files often have them
     points: int | None = None
     noise: float = 0.0
     ratio: float = 4
@@ -44,6 +45,10 @@ SETTINGS = {
     "points": Setting("points only"),
     "noise_0.5": Setting("points only, noise 0.5 %", noise=0.005),
     "noise_1": Setting("points only, noise 1 %", noise=0.01),
+    "given_noise_0.5": Setting("normals given, noise 0.5 %", given=True, noise=0.005),
+    "planes": Setting("plane fits given as normals", planes=16),
+    "planes_noise_0.5": Setting("plane fits given as normals, noise 0.5 %", planes=16, noise=0.005),
+    "planes_2048": Setting("plane fits given as normals, 2048 points", planes=16, points=2048),
     "given_2048": Setting("normals given, 2048 points", given=True, points=2048),
     "2048": Setting("points only, 2048 points", points=2048),
     "given_625": Setting("normals given, 625 points", given=True, points=625),
@@ -64,7 +69,7 @@ LEGEND = (
 
 
 def inputs(cases: Iterator[Case], setting: Setting, seed: int) -> Iterator[Case]:
-    """The cases as a setting wants them, always with normals: true or estimated."""
+    """The cases as a setting wants them, always with normals: true ones or estimated."""
     for case in cases:
         rng = generator(seed, case.truth.shape, setting.title)
         points, normals = case.points, case.normals
@@ -73,9 +78,12 @@ def inputs(cases: Iterator[Case], setting: Setting, seed: int) -> Iterator[Case]
             points, normals = points[kept], normals[kept] if normals is not None else None
         if setting.noise:
             points = points + setting.noise * rng.standard_normal(points.shape)
-        if not setting.given:
+        if setting.planes and normals is not None:
+            planes = estimate_normals(points, setting.planes, orient=False)
+            normals = np.where((planes * normals).sum(1, keepdims=True) < 0, -planes, planes)
+        elif not setting.given:
             normals = estimate_normals(points)
-        elif normals is None:
+        if normals is None:
             raise ValueError(f"{case.truth.shape}: has no normals, which the setting '{setting.title}' needs")
         yield Case(setting.title, points, normals, case.truth)
 
@@ -89,7 +97,7 @@ def network(method: str) -> nn.Module | Upsampler | str:
 
 def normals_for(method: str, case: Case, setting: Setting) -> np.ndarray | None:
     """Those that a method gets: "surface" finds missing ones by itself, as for users."""
-    return case.normals if setting.given or method != "surface" else None
+    return case.normals if setting.given or setting.planes or method != "surface" else None
 
 
 def clouds(cases: list[Case], setting: Setting, methods: list[str], seed: int, folder: Path) -> Iterator[Row]:

@@ -56,7 +56,8 @@ def test_the_larger_network_makes_the_last_step_alone(monkeypatch: pytest.Monkey
     project = Surface.project
 
     def counted(self: Surface, query: torch.Tensor, *rest: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        seen[self.projector.out.in_features] += query.shape[1]
+        if self.projector.out.in_features in seen:  # not what judges given normals
+            seen[self.projector.out.in_features] += query.shape[1]
         return project(self, query, *rest)
 
     monkeypatch.setattr(Surface, "project", counted)
