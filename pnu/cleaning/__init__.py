@@ -34,6 +34,7 @@ __all__ = [
     "Cleaned",
     "Doubts",
     "Treatment",
+    "axes_anew",
     "clean_cloud",
     "is_noisy",
     "stray_points",
@@ -101,12 +102,16 @@ def clean_cloud(
 def with_axes_anew(found: Cleaned, why: str, *, lines: Treatment = "auto") -> Cleaned:
     """A clean cloud whose normals are taken for their sides alone: as one without, but that their sides are known."""
     assert found.cloud.normals is not None
-    count = int(np.isfinite(found.cloud.normals).all(1).sum())
-    note = (
+    notes = (*found.cloud.notes, axes_anew(found.cloud.normals, why))
+    return _with_character(found._replace(cloud=found.cloud._replace(notes=notes)), lines)
+
+
+def axes_anew(normals: NDArray[np.float64], why: str) -> str:
+    """A line on given normals (n, 3) whose axes are poor."""
+    count = int(np.isfinite(normals).all(1).sum())
+    return (
         f"normals: of {count} given the sides alone are taken, their axes are found anew, they are {why} (normals=keep)"
     )
-    found = found._replace(cloud=found.cloud._replace(notes=(*found.cloud.notes, note)))
-    return _with_character(found, lines)
 
 
 def _with_character(found: Cleaned, lines: Treatment) -> Cleaned:

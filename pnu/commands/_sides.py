@@ -12,8 +12,9 @@ if TYPE_CHECKING:
 
 CHOICES = ("auto", "orient", "estimate", "keep")
 NORMALS = (
-    "auto: the file's, turned over where they contradict each other, estimated where missing; orient: the file's axes, "
-    "all sides chosen; estimate: all estimated; keep: the file's as they are"
+    "auto: the file's, turned over where they contradict each other, estimated where missing; of poor ones, such as "
+    "plane fits, the sides alone, but pnu normals keeps their axes; orient: the file's axes, all sides chosen; "
+    "estimate: all estimated; keep: the file's as they are"
 )
 VIEWPOINT = (
     "x,y,z, place of the sensor, or a file of its places, with times or without, as a scanner's way: normals look to "
@@ -59,6 +60,26 @@ def with_normals(cloud: "Cloud", settled: "Settled") -> "Cloud":
     """A cloud with these, and a line on them as its last note where something was done."""
     notes = (*cloud.notes, *[f"normals: {settled.words}"] * bool(settled.side))
     return cloud._replace(normals=settled.normals, notes=notes)
+
+
+def with_good_axes(cfg: Any, cloud: "Cloud", settled: "Settled") -> tuple["Settled", str]:
+    """The normals of a cloud for its surface, with normals=auto their axes found anew where given ones are poor, and a
+    line on that."""
+    from pnu.cleaning import axes_anew
+    from pnu.geometry.normal_estimation import normals_on_sides
+    from pnu.geometry.unit_sphere import unit_sphere_frame
+    from pnu.upsamplers.learned_normals import learned_normals
+    from pnu.upsamplers.poor_axes import poor_axes
+
+    if cloud.normals is None or cfg.normals != "auto":
+        return settled, ""
+    why = poor_axes(cloud.points, settled.normals)
+    if not why:
+        return settled, ""
+    unit = unit_sphere_frame(cloud.points).to_unit(cloud.points)
+    with stages(cfg.quiet) as progress:
+        found = learned_normals(unit, normals_on_sides(cloud.points, settled.normals), progress)
+    return settled._replace(normals=found), axes_anew(cloud.normals, why)
 
 
 def cleaned(cfg: Any, cloud: "Cloud", *, outliers: Any = "auto", lines: Any = "auto") -> tuple["Cleaned", "Cloud"]:

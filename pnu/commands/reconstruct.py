@@ -71,6 +71,9 @@ def reconstruct(cfg: Any) -> None:
     settled = _sides.sided(cfg, cloud)
     if settled.side:
         say(f"        normals: {settled.words}")
+    settled, note = _sides.with_good_axes(cfg, cloud, settled)
+    if note:
+        say(f"        {note}")
     normals = settled.normals
     for text in describe_cloud(points, normals).warnings():
         warn(text)

@@ -108,7 +108,8 @@ class Surface(nn.Module):
         smoothing: share of the crops in training whose inner points are themselves projected first, as those of a noisy
             cloud are at work
         refining: share of the crops in training whose inner points get the network's own normals first
-        passes: at work, times that the normals of the cloud are replaced by those that the network finds at its points
+        passes: at work, times that the normals of the cloud are replaced by those that the network finds at its points;
+            where this is not 0 and there is no noise, two more
         messages: numbers that each point of a cloud tells those that look at it, so that these know more than their
             own neighbors; the network finds them at the point, in each of the passes, or in one for them alone
         sphere: start from the sphere that fits the neighbors (algebraic point set surface), not from the seed

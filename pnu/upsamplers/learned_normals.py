@@ -10,7 +10,6 @@ from pnu.upsamplers.context import Context
 from pnu.upsamplers.inference import LoadedWeights, inferring
 from pnu.upsamplers.surface_projection import SurfaceProjection, noise_in_spacings
 
-PASSES = 2  # a third changes little
 Floats = NDArray[np.float64]
 
 
@@ -18,15 +17,14 @@ def learned_normals(points: Floats, normals: Floats, progress: Progress = silent
     """Unit normals at points (n, 3) of a cloud in the unit sphere, from rough ones (n, 3) whose sides agree: (n, 3).
 
     As `pnu upsample` has them where a cloud comes without: the shipped network sees each point's neighbors with their
-    rough normals, then with its own; in a noisy cloud also once its points lie on the surface.
+    rough normals, then a few times with its own; in a noisy cloud also once its points lie nearer to the surface.
     """
     character: Character = "noisy" if is_noisy(points, normals) else "clean"
     network = LoadedWeights("surface").network(character=character, device="cpu")
     with inferring(network):
         upsampler, context = SurfaceProjection(network), Context(progress=progress)
         cloud = np.hstack([points, normals])
-        cloud = upsampler.with_refined_normals(cloud, PASSES, context)
-        if noise_in_spacings(cloud) > FAINT:
-            cloud = upsampler.smoothed(cloud, context)
-        found = cloud[:, 3:6]
+        cloud = upsampler.with_refined_normals(cloud, network.passes, context)
+        noisy = noise_in_spacings(cloud) > FAINT
+        found = (upsampler.smoothed if noisy else upsampler.settled)(cloud, context)[:, 3:6]
     return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-12))

@@ -44,6 +44,7 @@ STILL_EVEN = 0.4  # so much where points were smoothed
 MOVED = 2.0  # smoothing moves points by so many times the noise at most, lest tips are drawn to the rest,
 MOVED_ALONG = 3.0  # where it moves them along given normals
 ROUNDS, ROUNDS_ALONG = 2, 8  # of smoothing
+MORE = 2  # passes of normals where there is no noise
 KEPT = 2**18  # queries whose projections are kept in one file
 BATCH = 512  # queries at once on a CPU,
 BATCHES = 32  # of which its threads share so many
@@ -85,9 +86,9 @@ class SurfaceProjection:
             compile_in_background()
         cloud = self.with_refined_normals(cloud, self.network.passes, context)
         measured = cloud[:, :6]
-        staying = measured[:0]
-        if context.smooth or noise_in_spacings(cloud) > FAINT:
-            cloud = self.smoothed(cloud, context)
+        noisy = context.smooth or noise_in_spacings(cloud) > FAINT
+        staying, cloud = measured[:0], self.smoothed(cloud, context) if noisy else self.settled(cloud, context)
+        if noisy:
             staying = cloud[:, :6] if count > len(cloud) and is_even(cloud, STILL_EVEN) else staying
         places = cloud[:, :3]
         counts = point_counts(places, count, context.density)
@@ -184,10 +185,16 @@ class SurfaceProjection:
                 smooth = self._anew(smooth, context, f"normals of the smooth points{which and ','}{which}")
         return smooth
 
-    def with_refined_normals(self, cloud: Floats, passes: int, context: Context) -> Floats:
+    def settled(self, cloud: Floats, context: Context) -> Floats:
+        """A cloud without noise (n, 6 + messages), its normals, if the network finds them, found anew a few times more:
+        they come nearer to the true ones, where those of a noisy cloud would rather follow its noise."""
+        passes = self.network.passes
+        return self.with_refined_normals(cloud, MORE, context, after=passes) if passes else cloud
+
+    def with_refined_normals(self, cloud: Floats, passes: int, context: Context, *, after: int = 0) -> Floats:
         """A cloud (n, 6) with the normals that the network finds at its points, so many times one after the other, and
         with messages, (n, 6 + messages): without passes these alone."""
-        for number in range(1, passes + 1):
+        for number in range(after + 1, after + passes + 1):
             cloud = self._anew(cloud, context, f"normals, pass {number}")
         if self.network.messages and not passes:
             cloud = np.hstack([cloud, self._anew(cloud, context, "what points tell")[:, 6:]])

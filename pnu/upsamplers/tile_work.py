@@ -319,7 +319,7 @@ def looked_at(
     cloud, frame = in_unit_sphere(rows["point"], rows["normal"])
     measured = upsampler.with_refined_normals(cloud, upsampler.network.passes, context)
     noisy = plan.facts.smooth and not plan.facts.keep
-    return measured, upsampler.smoothed(measured, context) if noisy else measured, frame
+    return measured, (upsampler.smoothed if noisy else upsampler.settled)(measured, context), frame
 
 
 def looked_at_beside_borders(

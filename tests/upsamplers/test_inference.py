@@ -259,8 +259,8 @@ def test_progress_reaches_the_end_of_each_stage() -> None:
         model=Spread(),
         progress=lambda s, done, total: calls.setdefault(s, []).append((done, total)),
     )
-    # normals and two passes of the surface model for them; network and farthest points in each of two passes
-    assert len(calls) == 7
+    # normals and four passes of the surface model for them; network and farthest points in each of two passes
+    assert len(calls) == 9
     for steps in calls.values():
         done = [step[0] for step in steps]
         assert done == sorted(done)
