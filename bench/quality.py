@@ -19,6 +19,7 @@ from pnu import metrics, reconstruction
 from pnu.benchmark import Case, Row, case_source, columns, summarize
 from pnu.benchmark.cases import generator
 from pnu.benchmark.result_tables import row_cell
+from pnu.cleaning import Treatment
 from pnu.geometry.mesh_topology import vertex_normals
 from pnu.geometry.normal_estimation import estimate_normals
 from pnu.io import atomic_path, read_json, write_cloud, write_json, write_mesh
@@ -106,7 +107,9 @@ def clouds(cases: list[Case], setting: Setting, methods: list[str], seed: int, f
         model = network(method)
         for case in cases:
             normals = normals_for(method, case, setting)
-            dense = upsample(case.points, normals, ratio=setting.ratio, model=model, seed=seed)
+            # all others get the same normals, also where better ones could be found
+            signs: Treatment = "auto" if method == "surface" else "keep"
+            dense = upsample(case.points, normals, ratio=setting.ratio, model=model, signs=signs, seed=seed)
             (folder / Path(method).name).mkdir(parents=True, exist_ok=True)
             write_cloud(folder / Path(method).name / f"{case.truth.shape}.ply", dense[:, :3], dense[:, 3:])
             values = metrics.compare(dense, case.truth.samples)

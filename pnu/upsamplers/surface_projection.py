@@ -5,7 +5,7 @@ There are no patches, hence no borders; the cost grows with the output; any rati
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
@@ -51,6 +51,7 @@ BATCHES = 32  # of which its threads share so many
 AROUND = 8  # points of which one at most is dropped,
 DOUBTFUL = 16  # looked for among so many for each point to drop
 DISTANT, RISKY = 8.0, 1.5  # weight of the distance from an even cloud, in spacings, beside the error; limit of both
+AT_REST = 0.015  # spacings that a point moves in a refinement after which it needs no other
 ROOM = 0.7  # around a point that is kept, in spacings that evenly spread points would have
 LONG = 10_000  # points made from which on a computation takes long enough to have kernels compiled beside it
 MANY = 3, 2  # candidates and shortlist where points stay,
@@ -134,9 +135,7 @@ class SurfaceProjection:
         query = named("thinning", lambda step: thin_between(query, more, kept, step))
         if network.relaxation:
             query = named("even spacing", lambda step: even_out(query, network.relaxation, step, kept))
-        for i in range(1, network.refinements + 1):
-            refined, error = self.projected(query, cloud, context, f"refinement {i}", steps[i])
-            query = slid(query, refined, network.slide)
+        query, error = self.refined(query, error, cloud, context, steps[1:])
         if len(kept) and not part and is_even(cloud):
             near = within_reach(query[:, :3], error, cloud[:, :3], new)
             query, error = query[near], error[near]
@@ -144,6 +143,26 @@ class SurfaceProjection:
         if first == len(cloud):  # of a part others make what lies at its borders
             query = covering(query, kept, cloud, partial(self._nearer, cloud=cloud, context=context))
         return np.concatenate([self.with_normals(kept, cloud, context), query]) if len(kept) else query
+
+    def refined(
+        self, query: Floats, error: Floats, cloud: Floats, context: Context, steps: Sequence[Callable[..., Work]]
+    ) -> tuple[Floats, Floats]:
+        """Queries (m, 6) and their expected errors (m,) after each of the steps. Those that one leaves where they are
+        have come to rest, and are not looked at again by the same network."""
+        still, rows = AT_REST * spacing(cloud[:, :3]), np.arange(len(query))
+        for i, step in enumerate(steps):
+            if not len(rows):
+                break
+            some = query if len(rows) == len(query) else query[rows]
+            found, errors = self.projected(some, cloud, context, f"refinement {i + 1}", step)
+            found = slid(some, found, self.network.slide)
+            moved = np.linalg.norm(found[:, :3] - some[:, :3], axis=1)
+            if some is query:
+                query, error = found, errors
+            else:
+                query[rows], error[rows] = found, errors
+            rows = rows[moved > still] if step in steps[i + 1 : i + 2] else np.arange(len(query))
+        return query, error
 
     def _nearer(self, moved: Floats, number: int, cloud: Floats, context: Context) -> Floats:
         """Points (k, 6) that came nearer to those that had none near, on the surface again."""

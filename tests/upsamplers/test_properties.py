@@ -26,6 +26,7 @@ from pnu.data import shapes
 from pnu.geometry.mesh_sampling import closest_points, sample_area, sample_poisson_disk
 from pnu.io import read_cloud, read_mesh, write_cloud
 from pnu.runtime.system_libraries import open3d_error
+from pnu.upsamplers import surface_projection
 
 Array = np.ndarray
 MESH = shapes.make("mug")
@@ -262,3 +263,15 @@ def test_metrics_depend_neither_on_threads_nor_on_the_order_of_files() -> None:
         assert measured(["nut", "mug"]) == one
     finally:
         torch.set_num_threads(1)
+
+
+def test_points_at_rest_are_not_refined_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Most are after one refinement; the others make the same surface as if all were refined again."""
+    totals: dict[str, int] = {}
+    few = upsample(POINTS, NORMALS, 4, progress=lambda stage, done, total: totals.update({stage: total}))
+    assert totals["refinement 2"] < 0.7 * totals["refinement 1"]
+    monkeypatch.setattr(surface_projection, "AT_REST", -1.0)
+    everything = upsample(POINTS, NORMALS, 4, progress=lambda stage, done, total: totals.update({stage: total}))
+    assert totals["refinement 2"] == totals["refinement 1"]
+    assert error(few) == pytest.approx(error(everything), rel=0.02)
+    assert (cKDTree(everything[:, :3]).query(few[:, :3])[0] < 0.05 * spacing(POINTS)).mean() > 0.97
