@@ -84,6 +84,15 @@ def test_plane_fits_are_poor_whatever_their_neighbors(noise: float) -> None:
         assert poor_axes(points, fitted_within(points, normals, radius * apart)) == PLANES
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("n", "noise"), [(300, 0.0), (1000, 0.0), (5000, 0.0), (5000, 0.006)])
+def test_true_normals_are_told_from_plane_fits_on_all_shapes(n: int, noise: float) -> None:
+    for name in shapes.names():
+        points, normals = cloud(name, n, noise)
+        assert poor_axes(points, normals) == "", name
+        assert poor_axes(points, fitted(points, normals)) == PLANES, name
+
+
 def test_rough_ones_are_poor() -> None:
     points, normals = cloud()
     for much in (12, 20):
