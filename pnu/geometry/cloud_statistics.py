@@ -16,6 +16,7 @@ CONTRADICTING = (
 FAR = 1.0  # radii of the middle 99 % of the points: one that far from its fourth neighbor stands alone
 UNEVEN = 2.0  # random points of an even density stay below
 FAINT = 0.05  # noise in spacings that does not stand out from curvature
+NOTHING = 0.001  # below that, as on flat faces, it is rounding
 
 
 class CloudStatistics(NamedTuple):
@@ -38,7 +39,8 @@ class CloudStatistics(NamedTuple):
 
     def __str__(self) -> str:
         spread = f"{self.middle:.3g}, {'uneven' if self.uneven else 'even'} ({self.dense:.3g} to {self.sparse:.3g})"
-        share = f"{self.noise / self.middle:.2g} of it, {100 * self.noise / self.radius:.2g} % of the radius"
+        noise = max(self.noise, NOTHING * self.middle)
+        share = f"{noise / self.middle:.2g} of it, {100 * noise / self.radius:.2g} % of the radius"
         faint = self.noise < FAINT * self.middle
         return f"spacing {spread}; " + (f"no noise to speak of (below {share})" if faint else f"noise about {share}")
 

@@ -22,6 +22,7 @@ def test_spacing_of_a_grid() -> None:
     assert found.middle == pytest.approx(1, abs=0.15)
     assert not found.uneven
     assert found.noise < 1e-6
+    assert "no noise to speak of (below 0.001 of it" in str(found)  # not some 1e-25, which is rounding
     assert found.radius == pytest.approx(29 / np.sqrt(2))
 
 
