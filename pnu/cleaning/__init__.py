@@ -8,9 +8,15 @@ from numpy.typing import NDArray
 
 from pnu.cleaning.outliers import MANY, stray_points
 from pnu.geometry.anisotropy import averaged, thinned_lines
-from pnu.geometry.cloud_normals import Settled, camera_sight, camera_words, contradiction, settled_normals
+from pnu.geometry.cloud_normals import (
+    Settled,
+    camera_sight,
+    camera_words,
+    contradiction,
+    normals_on_sides,
+    settled_normals,
+)
 from pnu.geometry.noise_level import noise_level
-from pnu.geometry.normal_estimation import normals_on_sides
 from pnu.geometry.single_view import camera_place
 from pnu.geometry.spacing import spacing
 from pnu.io import Cloud
@@ -100,7 +106,10 @@ def clean_cloud(
 
 
 def with_axes_anew(found: Cleaned, why: str, *, lines: Treatment = "auto") -> Cleaned:
-    """A clean cloud whose normals are taken for their sides alone: as one without, but that their sides are known."""
+    """A clean cloud whose normals are taken for their sides alone: as one without, but that their sides are known.
+
+    Where no sensor says the sides (`found.seen`) the shape may (`normals_on_sides`).
+    """
     assert found.cloud.normals is not None
     notes = (*found.cloud.notes, axes_anew(found.cloud.normals, why))
     return _with_character(found._replace(cloud=found.cloud._replace(notes=notes)), lines)
@@ -122,7 +131,9 @@ def _with_character(found: Cleaned, lines: Treatment) -> Cleaned:
         note = f"lies in lines: {len(rows)} points, less dense along them, stand for {len(cloud.points)} (lines=keep)"
         cloud = chosen(cloud, rows)._replace(points=averaged(cloud.points, rows), notes=(*notes, note))
     share = len(found.stray) / (len(found.stray) + len(cloud.points))
-    known = None if cloud.normals is None else Settled(normals_on_sides(cloud.points, cloud.normals), "", "")
+    known = None if cloud.normals is None else normals_on_sides(cloud.points, cloud.normals, sure=found.seen)
+    if known is not None and known.words:
+        cloud = cloud._replace(notes=(*cloud.notes, f"normals: {known.words} (normals=keep)"))
     found = found._replace(cloud=cloud._replace(normals=None), estimated=known)
     scanned = found._replace(character="scanned" if share > MANY or found.camera is not None else "clean")
     if rows is not None:

@@ -66,7 +66,7 @@ def with_good_axes(cfg: Any, cloud: "Cloud", settled: "Settled") -> tuple["Settl
     """The normals of a cloud for its surface, with normals=auto their axes found anew where given ones are poor, and a
     line on that."""
     from pnu.cleaning import axes_anew
-    from pnu.geometry.normal_estimation import normals_on_sides
+    from pnu.geometry.cloud_normals import normals_on_sides
     from pnu.geometry.unit_sphere import unit_sphere_frame
     from pnu.upsamplers.learned_normals import learned_normals
     from pnu.upsamplers.poor_axes import poor_axes
@@ -77,9 +77,11 @@ def with_good_axes(cfg: Any, cloud: "Cloud", settled: "Settled") -> tuple["Settl
     if not why:
         return settled, ""
     unit = unit_sphere_frame(cloud.points).to_unit(cloud.points)
+    sides = normals_on_sides(cloud.points, settled.normals, sure=settled.seen)
     with stages(cfg.quiet) as progress:
-        found = learned_normals(unit, normals_on_sides(cloud.points, settled.normals), progress)
-    return settled._replace(normals=found), axes_anew(cloud.normals, why)
+        found = learned_normals(unit, sides.normals, progress)
+    note = axes_anew(cloud.normals, why)
+    return settled._replace(normals=found), f"{note}; {sides.words}" if sides.words else note
 
 
 def cleaned(cfg: Any, cloud: "Cloud", *, outliers: Any = "auto", lines: Any = "auto") -> tuple["Cleaned", "Cloud"]:

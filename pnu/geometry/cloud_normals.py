@@ -8,8 +8,8 @@ import numpy as np
 
 from pnu.geometry.cloud_statistics import CONTRADICTING, contradicting
 from pnu.geometry.flipped_parts import flipped_share
-from pnu.geometry.normal_estimation import complete_normals, orient_normals
-from pnu.geometry.normal_sides import hidden, repaired_signs, seen_signs
+from pnu.geometry.normal_estimation import complete_normals, orient_normals, refit_normals
+from pnu.geometry.normal_sides import hidden, largest_piece, repaired_signs, seen_signs
 from pnu.geometry.orientation import NeighborCloud, gauss_law
 from pnu.geometry.scanner_within import scanner_within
 from pnu.geometry.single_view import camera_place, is_camera, seen_from_one_side
@@ -28,6 +28,7 @@ LEVEL = 0.7  # height of the mean normal of what is mostly ground
 TELLING, MISSED = 1000, 0.15  # points of a sensor that tell whether it saw them, and their share that it may not have
 MOST_SCANS = 100  # whose scanners are looked for
 FAR = 100.0  # extents of a cloud from it to where it was seen from
+MISTAKEN = 0.02  # share of the points in a smooth piece on the wrong side from which on a closed shape decides
 AGAINST = 0.2  # as much may Gauss' law speak for the other side: things on a ground are open below
 
 
@@ -106,6 +107,25 @@ def settled_normals(
     settled[order] = lines * sign[:, None]
     words = _words(known, int((sign[known] < 0).sum()), why, side + doubt)
     return Settled(settled, words, side, seen=sight is not None)
+
+
+def normals_on_sides(points: np.ndarray, normals: np.ndarray, *, sure: bool = False) -> Settled:
+    """Rough normals of points (n, 3) on the sides of given ones (n, 3), of which the sides alone count.
+
+    What orients the normals that come with points often takes the wrong side beyond an edge, for whole parts. On a
+    closed shape all look outward, therefore, unless most look inward; but not if only scattered ones do not, as it is
+    on thin walls that the shape misleads. sure: their sides are known, by a sensor.
+    """
+    order = np.lexsort(points.T)
+    unit, found = unit_sphere_frame(points[order]).to_unit(points[order]), np.empty(points.shape)
+    rough, words = complete_normals(unit, normals[order]), ""
+    if not sure:
+        repair = repaired_signs(unit, rough)
+        wrong = repair.signs < 0
+        if repair.side == "outward" and largest_piece(unit, rough, wrong) > MISTAKEN * len(wrong):
+            rough, words = rough * repair.signs[:, None], f"{wrong.mean():.0%} of them turned over; side: {OUTWARD}"
+    found[order] = refit_normals(unit, rough)
+    return Settled(found, words, "", seen=sure)
 
 
 def check_not_a_line(points: np.ndarray) -> None:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from pnu import kernels
 from pnu.geometry.orientation import CHUNK, ROWS, SOME_NOISE, NeighborCloud, agreeing_normals, field, signs
 from pnu.geometry.point_tree import PointTree
-from pnu.geometry.unit_sphere import unit_sphere_frame
 from pnu.runtime.threads import map_on_threads, thread_count
 
 Array = NDArray[Any]  # float64 or float32
@@ -64,17 +63,6 @@ def orient_normals(points: Array, normals: Array) -> Array:
 def refit_normals(points: Array, normals: Array) -> Array:
     """What `estimate_normals` makes of points (n, 3) once it knows their sides, those of normals (n, 3)."""
     return _refined(NeighborCloud.of(points), normals, oriented=True).astype(points.dtype)
-
-
-def normals_on_sides(points: Array, normals: Array) -> Array:
-    """Rough normals of points (n, 3), whatever their order and unit, on the sides of given ones (n, 3).
-
-    Of these, NaN where there is none, the sides alone count.
-    """
-    order = np.lexsort(points.T)
-    unit, found = unit_sphere_frame(points[order]).to_unit(points[order]), np.empty(points.shape)
-    found[order] = refit_normals(unit, complete_normals(unit, normals[order]))
-    return found
 
 
 def flip_to_reference(normals: Array, points: Array, ref_points: Array, ref_normals: Array) -> Array:

@@ -163,6 +163,14 @@ def repaired_signs(points: np.ndarray, normals: np.ndarray) -> Repair:
     return Repair(np.where(np.bincount(part, found)[part] < 0, -found, found), "most")
 
 
+def largest_piece(points: np.ndarray, lines: np.ndarray, some: np.ndarray) -> int:
+    """Points of the largest smooth piece that some (n,) of the points (n, 3) with unit lines (n, 3) make."""
+    pairs = Couplings.of(points, lines)
+    smooth = (np.abs(pairs.cosine) > SMOOTH) & (pairs.rise < SLOPE) & some[pairs.first] & some[pairs.second]
+    part = connected_parts(pairs.first[smooth], pairs.second[smooth], len(points))
+    return int(np.bincount(part[some], minlength=1).max())
+
+
 def _patchwise(pairs: Couplings, outward: np.ndarray) -> np.ndarray:
     """Signs (n,) near those of `outward` (n,), alike among neighbors as far as those are."""
     n, plus = len(outward), outward >= 0

@@ -24,7 +24,13 @@ from pnu.cleaning import Character, is_noisy, stray_points
 from pnu.cleaning.outliers import MANY
 from pnu.geometry.anisotropy import thinned_lines
 from pnu.geometry.cells import Cells
-from pnu.geometry.cloud_normals import contradiction, is_height_map, settled_normals, sight_from_within
+from pnu.geometry.cloud_normals import (
+    contradiction,
+    is_height_map,
+    normals_on_sides,
+    settled_normals,
+    sight_from_within,
+)
 from pnu.geometry.cloud_statistics import FAINT
 from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.normal_estimation import complete_normals
@@ -446,6 +452,8 @@ def _coarse_cloud(folder: Path, keys: Keys, facts: Facts, full: list[int]) -> No
                 found = found._replace(viewpoint=found.viewpoint[kept])
         rows = rows[kept]
     asked = asked_sight(keys.viewpoint, keys.up, keys.side, attributes_of(rows))
+    if facts.poor and not facts.turned:  # a tile does not see whether the shape is closed
+        facts.turned = normals_on_sides(rows["point"], rows["normal"]).words
     settled = settled_normals(
         rows["point"], rows["normal"] if facts.given else None,
         choice=keys.normals if keys.normals != "auto" or not facts.turned else "orient",  # type: ignore[arg-type]

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from pnu.cleaning import stray_points
 from pnu.geometry.anisotropy import averaged
+from pnu.geometry.cloud_normals import normals_on_sides
 from pnu.geometry.even_spacing import RANK, tangent_discs
 from pnu.geometry.farthest_sampling import farthest_apart, farthest_order, single_precision
-from pnu.geometry.normal_estimation import complete_normals, normals_on_sides
+from pnu.geometry.normal_estimation import complete_normals
 from pnu.geometry.normal_sides import seen_signs, voted_signs
 from pnu.geometry.point_tree import PointTree
 from pnu.geometry.unit_sphere import Frame, unit_sphere_frame
@@ -113,7 +114,7 @@ def prepared(plan: Plan, number: int) -> None:
     else:
         normals = _normals(plan, rows)
         if facts.poor:
-            normals = normals_on_sides(points, normals)
+            normals = normals_on_sides(points, normals, sure=True).normals
     attributes = attributes_of(rows)
     inside = plan.cells.inside(points, number)
     share = Share(int(inside.sum()), 0.0, [], 0.0, spread, strays)

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 import pnu
 from pnu.commands.upsample import main as upsample_main
 from pnu.data import shapes
+from pnu.geometry.cloud_normals import normals_on_sides
 from pnu.geometry.mesh_sampling import closest_points, sample_area, sample_poisson_disk
 from pnu.geometry.normal_estimation import estimate_normals
 from pnu.io import write_cloud
@@ -168,3 +169,36 @@ def test_smoothing_keeps_given_normals_and_moves_points_along_them() -> None:
     np.testing.assert_allclose(np.cross(step, normals), 0, atol=1e-14)
     assert np.linalg.norm(step, axis=1).max() < 0.04
     assert off(smooth) < 0.35 * off(np.hstack([noisy, normals]))
+
+
+def test_sides_that_a_closed_shape_shows_to_be_wrong_are_not_taken() -> None:
+    """Whole faces turned over, as by what follows neighbors over edges; but not what a sensor says, nor all of them."""
+    points, normals = cloud(n=1500)
+    given = fitted(points, normals)
+    turned = np.where(normals[:, 2:] > 0.9, -given, given)
+    assert 0.1 < (turned != given).any(1).mean() < 0.5
+
+    def wrong(found: Array) -> float:
+        return float(((found * normals).sum(1) < 0).mean())
+
+    settled = normals_on_sides(points, turned)
+    assert wrong(settled.normals) < 0.04
+    assert "of them turned over; side: outward" in settled.words
+    assert wrong(normals_on_sides(points, turned, sure=True).normals) > 0.08
+    assert wrong(normals_on_sides(points, -given).normals) > 0.96  # a room
+    few = normals_on_sides(points, given)
+    assert wrong(few.normals) < 0.04
+    assert not few.words
+    dense = pnu.upsample(points, turned, ratio=2)
+    near = cKDTree(points).query(dense[:, :3])[1]
+    assert ((dense[:, 3:] * normals[near]).sum(1) < 0).mean() < 0.05
+
+
+def test_of_an_open_surface_the_sides_stay() -> None:
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-1, 1, (900, 2)), np.zeros(900)])
+    points[:, 2] = 0.2 * np.sin(3 * points[:, 0])
+    down = fitted(points, np.tile([0.0, 0.0, -1.0], (900, 1)))
+    settled = normals_on_sides(points, down)
+    assert (settled.normals[:, 2] < 0).all()
+    assert not settled.words
