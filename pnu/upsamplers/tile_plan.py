@@ -452,12 +452,13 @@ def _coarse_cloud(folder: Path, keys: Keys, facts: Facts, full: list[int]) -> No
                 found = found._replace(viewpoint=found.viewpoint[kept])
         rows = rows[kept]
     asked = asked_sight(keys.viewpoint, keys.up, keys.side, attributes_of(rows))
-    if facts.poor and not facts.turned:  # a tile does not see whether the shape is closed
+    found = sight_of(keys.input, attributes_of(rows)) or found
+    if facts.poor and not facts.turned and asked is None and found is None:  # a tile does not see whether all is closed
         facts.turned = normals_on_sides(rows["point"], rows["normal"]).words
     settled = settled_normals(
         rows["point"], rows["normal"] if facts.given else None,
         choice=keys.normals if keys.normals != "auto" or not facts.turned else "orient",  # type: ignore[arg-type]
-        asked=asked, found=sight_of(keys.input, attributes_of(rows)) or found,
+        asked=asked, found=found,
     )  # fmt: skip
     with atomic_path(folder / "coarse.npy") as temporary:
         np.save(temporary, np.hstack([rows["point"], settled.normals]))
