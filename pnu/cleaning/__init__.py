@@ -54,7 +54,9 @@ class Cleaned(NamedTuple):
     cloud: Cloud  # its notes say what was done
     stray: NDArray[np.int64]  # rows of the cloud before that were taken out as stray
     character: Character = "clean"  # of a cloud without normals; what has them is "clean"
-    estimated: Settled | None = None  # rough normals of a cloud that has none, where they are known
+    estimated: Settled | None = (
+        None  # rough normals, where known, of a cloud without, or of whose the sides alone count
+    )
     seen: bool = False  # a sensor, or what was asked for, decided the side of its normals
     camera: NDArray[np.float64] | None = None  # place (3,) from which all of a cloud without normals was seen
 

@@ -1,9 +1,9 @@
-"""Whether the normals of a cloud are worse than those that the surface model would find.
+"""Whether the normals that come with a cloud are worse than those that the surface model finds.
 
-Normals that come with points are often planes fitted to their neighbors, which round off edges and follow noise, or
-those of single measurements. Both lie far from what the network, looking at the points with these normals, makes of
-them: the first no farther than from plane fits, and the second lie more apart from plane fits than it. True normals
-lie near to it, and it is as far from plane fits as they are.
+Such normals are often planes fitted to each point's neighbors, which round off edges and follow noise, or those of
+single measurements. The network for bare clouds, shown the points with these normals, finds its own. Plane fits with
+some number of neighbors are then nearer to those given than the network's are. True normals lie nearer to the
+network's than to any plane fits. Rough ones are farther from plane fits than the network's, true ones about as far.
 """
 
 from functools import cache

@@ -87,10 +87,12 @@ class SurfaceProjection:
             compile_in_background()
         cloud = self.with_refined_normals(cloud, self.network.passes, context)
         measured = cloud[:, :6]
-        noisy = context.smooth or noise_in_spacings(cloud) > FAINT
-        staying, cloud = measured[:0], self.smoothed(cloud, context) if noisy else self.settled(cloud, context)
-        if noisy:
+        staying = measured[:0]
+        if context.smooth or noise_in_spacings(cloud) > FAINT:
+            cloud = self.smoothed(cloud, context)
             staying = cloud[:, :6] if count > len(cloud) and is_even(cloud, STILL_EVEN) else staying
+        else:
+            cloud = self.settled(cloud, context)
         places = cloud[:, :3]
         counts = point_counts(places, count, context.density)
         if counts is None:
