@@ -45,6 +45,7 @@ __all__ = [
     "is_noisy",
     "stray_points",
     "with_axes_anew",
+    "without_normals",
 ]
 
 
@@ -89,7 +90,7 @@ def clean_cloud(
     for name, value in (("outliers", outliers), ("lines", lines), ("signs", signs)):
         if value not in TREATMENTS:
             raise ValueError(f"{name}={value}: expected auto or keep")
-    camera = camera_place(cloud.points) if cloud.normals is None else None
+    given, camera = cloud, camera_place(cloud.points) if cloud.normals is None else None
     stray = np.flatnonzero(stray_points(cloud.points, camera)) if outliers == "auto" else np.empty(0, np.int64)
     notes = list(cloud.notes)
     if len(stray):
@@ -104,7 +105,17 @@ def clean_cloud(
     if cloud.normals is None:
         return _with_character(found, lines)
     why = "" if doubts is None or signs == "keep" else doubts(cloud.points, cloud.normals)
+    if why and (bare := without_normals(given, why)) is not None:
+        return clean_cloud(bare, outliers=outliers, lines=lines)
     return with_axes_anew(found, why, lines=lines) if why else found
+
+
+def without_normals(cloud: Cloud, why: str) -> Cloud | None:
+    """A cloud without its poor normals where a single camera saw it, which says their sides too; None elsewhere."""
+    assert cloud.normals is not None
+    if camera_place(cloud.points) is None:
+        return None
+    return cloud._replace(normals=None, notes=(*cloud.notes, axes_anew(cloud.normals, why)))
 
 
 def with_axes_anew(found: Cleaned, why: str, *, lines: Treatment = "auto") -> Cleaned:
@@ -133,7 +144,9 @@ def _with_character(found: Cleaned, lines: Treatment) -> Cleaned:
         note = f"lies in lines: {len(rows)} points, less dense along them, stand for {len(cloud.points)} (lines=keep)"
         cloud = chosen(cloud, rows)._replace(points=averaged(cloud.points, rows), notes=(*notes, note))
     share = len(found.stray) / (len(found.stray) + len(cloud.points))
-    known = None if cloud.normals is None else normals_on_sides(cloud.points, cloud.normals, sure=found.seen)
+    known = None  # what is fitted to lines has no sides either
+    if cloud.normals is not None and rows is None:
+        known = normals_on_sides(cloud.points, cloud.normals, sure=found.seen)
     if known is not None and known.words:
         cloud = cloud._replace(notes=(*cloud.notes, f"normals: {known.words} (normals=keep)"))
     found = found._replace(cloud=cloud._replace(normals=None), estimated=known)

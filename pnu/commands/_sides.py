@@ -90,7 +90,7 @@ def cleaned(cfg: Any, cloud: "Cloud", *, outliers: Any = "auto", lines: Any = "a
     Where keys or file say more of the side of normals than the shape of the cloud does, they decide it. With
     normals=auto the axes of poor ones are found anew.
     """
-    from pnu.cleaning import clean_cloud, with_axes_anew
+    from pnu.cleaning import clean_cloud, with_axes_anew, without_normals
     from pnu.geometry.cloud_normals import sight_by_places
     from pnu.io.sensor import asked_sight, sight_of
     from pnu.upsamplers.poor_axes import poor_axes
@@ -113,6 +113,8 @@ def cleaned(cfg: Any, cloud: "Cloud", *, outliers: Any = "auto", lines: Any = "a
     why = poor_axes(whole.points, settled.normals) if cfg.normals == "auto" else ""
     if not why:
         return found, whole
+    if (bare := without_normals(cloud, why)) is not None:
+        return cleaned(cfg, bare, outliers=outliers, lines=lines)
     found = with_axes_anew(found, why, lines=lines)
-    assert found.estimated is not None
-    return found, found.cloud._replace(normals=found.estimated.normals)
+    settled = found.estimated or sided(cfg, found.cloud, learned=False, places=places)
+    return found._replace(estimated=settled), found.cloud._replace(normals=settled.normals)

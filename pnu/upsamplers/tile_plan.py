@@ -390,6 +390,7 @@ def _decided(folder: Path, keys: Keys, facts: Facts, progress: Progress) -> None
         facts.poor = next(look["poor"] for look in found if look["poor"])
     if most("lined") and keys.lines == "auto" and keys.keep is not True and not facts.trusted:
         facts.lined = middle("lined")
+        facts.given = False  # what is fitted to lines has no sides either
     facts.apart = max(look["apart"] if facts.lined else look["apart_raw"] for look in found)
     facts.smooth = most("noisy")
     facts.heights = most("heights")

@@ -8,12 +8,13 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import pnu
+from pnu.cleaning import clean_cloud
 from pnu.commands.upsample import main as upsample_main
-from pnu.data import shapes
+from pnu.data import scanner, shapes
 from pnu.geometry.cloud_normals import normals_on_sides
 from pnu.geometry.mesh_sampling import closest_points, sample_area, sample_poisson_disk
 from pnu.geometry.normal_estimation import estimate_normals
-from pnu.io import write_cloud
+from pnu.io import Cloud, write_cloud
 from pnu.upsamplers.context import Context
 from pnu.upsamplers.inference import LoadedWeights
 from pnu.upsamplers.poor_axes import poor_axes
@@ -202,3 +203,16 @@ def test_of_an_open_surface_the_sides_stay() -> None:
     settled = normals_on_sides(points, down)
     assert (settled.normals[:, 2] < 0).all()
     assert not settled.words
+
+
+@pytest.mark.parametrize("kind", ["oneview", "lines"])
+def test_scans_with_plane_fits_are_treated_like_bare_ones(kind: str) -> None:
+    """A camera is looked for, and says the sides; of what is fitted to lines nothing is taken."""
+    scan = getattr(scanner, kind)(scanner.Scanner(MESH), np.random.default_rng(0))
+    bare = clean_cloud(Cloud(scan.points, None, {}))
+    found = clean_cloud(Cloud(scan.points, estimate_normals(scan.points, orient=False), {}), doubts=lambda *_: PLANES)
+    np.testing.assert_array_equal(found.cloud.points, bare.cloud.points)
+    assert found.cloud.normals is None
+    assert found.character == bare.character == "scanned"
+    assert (found.camera is None) == (bare.camera is None) == (kind == "lines")
+    assert any("axes are found anew" in note for note in found.cloud.notes)
