@@ -8,7 +8,8 @@ closed shapes there is none.
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from pnu.geometry.sphere_directions import sphere_directions
 from pnu.runtime.threads import thread_count
 
 Floats = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 FEWEST, MOST = 200, 2048  # points that tell, and that are looked at
 DIRECTIONS = 300  # of a half of the sphere,
@@ -37,11 +39,15 @@ STEEP, FLAT = 0.95, 0.25  # of land: cosine of the way it was seen with z; heigh
 GLANCE = 512, 80  # points and directions of a first look for a camera somewhere,
 HIDDEN = 0.075  # share of points behind others above which there is none
 CLOSE = 0.06  # so much more than the least may be behind others in ways that are tried
-TRIED, STARTS = 30, 3  # ways that are tried, both of their ends, and those of them the search starts from
+TRIED, STARTS = 30, 3  # ways that are tried, both of their ends, and those of them the search starts from,
+ALONG = 0.9  # which make angles with each other whose cosines are smaller
 AWAY, STEP = (1.6, 2.8), 0.35  # radii to a camera at first, and by which the search begins to move it
 WATCHED = 256  # points whose neighbors' angles are compared,
 WIDEST = 0.5  # logarithm by which one counts at most
-UNLIKELY, UNEVEN = 0.23, 0.07  # mean logarithm by which they differ, above which a way, or a place, is none to a camera
+CANDIDATES = 24  # neighbors among which the nearest are, as the place moves over
+NEARBY = 0.15  # at first
+UNLIKELY = 0.28  # mean logarithm by which they differ above which a way is none to a camera,
+HARDLY_UNEVEN, UNEVEN = 0.11, 0.07  # and a place none, by some of the points, and by all
 
 
 def is_camera(place: Floats, points: Floats) -> bool:
@@ -114,27 +120,63 @@ def _camera_of(data: bytes) -> Floats | None:
     starts = np.concatenate([side * away * ways for side in (1, -1) for away in AWAY])
     block = unit if len(unit) <= MOST else unit[np.argpartition((unit**2).sum(1), MOST)[:MOST]]
 
-    def unevenness(place: Floats, points: Floats = block) -> float:
-        """Mean absolute logarithm of angles to the second and third neighbor over the usual one, at some points."""
-        rays = points - place
-        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-300)
-        watched = np.linspace(0, len(points) - 1, min(WATCHED, len(points))).astype(int)
-        logarithms = np.log(np.maximum(PointTree(rays).nearest(rays[watched], 4)[0][:, 2:], 1e-12))
-        return float(np.minimum(np.abs(logarithms - np.median(logarithms)), WIDEST).mean())
+    def in_block(place: Floats) -> float:
+        return _unevenness(_angles(place, block)[0])
 
-    first = np.array([unevenness(start) for start in starts])
+    first = np.array([in_block(start) for start in starts])
     if first.min() > UNLIKELY:
         return None
+    for start in _apart(starts[np.argsort(first, kind="stable")], STARTS):
+        place = _moved(in_block, start, STEP)
+        if in_block(place) < HARDLY_UNEVEN:
+            place = _moved(partial(_among, near=_angles(place, unit, CANDIDATES)[1], points=unit), place, NEARBY)
+            if _unevenness(_angles(place, unit)[0]) < UNEVEN:
+                away = float(np.linalg.norm(place))
+                return middle + radius * place if NEAREST < away < FARTHEST else None
+    return None
+
+
+def _moved(unevenness: Callable[[Floats], float], start: Floats, step: float) -> Floats:
+    """The place (3,) near a start where that is least (Nelder and Mead 1965)."""
     from scipy.optimize import minimize  # takes a moment to load
 
-    for start in starts[np.argsort(first, kind="stable")[:STARTS]]:
-        simplex = start + STEP * np.vstack([np.zeros(3), np.eye(3)])
-        options = {"initial_simplex": simplex, "maxfev": 150, "xatol": 1e-3, "fatol": 1e-3}
-        found = minimize(unevenness, start, method="Nelder-Mead", options=options)
-        if found.fun < UNEVEN and unevenness(found.x, unit) < UNEVEN:  # of the block, and of all
-            away = float(np.linalg.norm(found.x))
-            return middle + radius * found.x if NEAREST < away < FARTHEST else None
-    return None
+    simplex = start + step * np.vstack([np.zeros(3), np.eye(3)])
+    options = {"initial_simplex": simplex, "maxfev": 150, "xatol": 1e-3, "fatol": 1e-3}
+    return np.asarray(minimize(unevenness, start, method="Nelder-Mead", options=options).x)
+
+
+def _angles(place: Floats, points: Floats, k: int = 4) -> tuple[Floats, Index]:
+    """Of some of the points (n, 3), as seen from a place (3,): angles to the k nearest, themselves the first, (m, k),
+    and their rows, (m, k)."""
+    rays = points - place
+    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-300)
+    watched = np.linspace(0, len(points) - 1, min(WATCHED, len(points))).astype(int)
+    return PointTree(rays).nearest(rays[watched], min(k, len(points)))
+
+
+def _among(place: Floats, near: Index, points: Floats) -> float:
+    """The unevenness of points in the first column of rows (m, k) among those of the other columns."""
+    rays = points[near] - place
+    rays /= np.maximum(np.linalg.norm(rays, axis=2, keepdims=True), 1e-300)
+    return _unevenness(np.sort(np.linalg.norm(rays - rays[:, :1], axis=2), axis=1)[:, :4])
+
+
+def _unevenness(angles: Floats) -> float:
+    """Mean absolute logarithm of the angles to the second and third neighbor (m, 4) over the usual one."""
+    logarithms = np.log(np.maximum(angles[:, 2:], 1e-12))
+    return float(np.minimum(np.abs(logarithms - np.median(logarithms)), WIDEST).mean())
+
+
+def _apart(places: Floats, count: int) -> list[Floats]:
+    """The first of the places (m, 3), and of those after it that lie in other directions: so many at most."""
+    found: list[Floats] = []
+    for place in places:
+        length = np.linalg.norm(place)
+        if all(place @ other < ALONG * length * np.linalg.norm(other) for other in found):
+            found.append(place)
+        if len(found) == count:
+            break
+    return found
 
 
 class OneSide(NamedTuple):

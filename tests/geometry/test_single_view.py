@@ -7,10 +7,11 @@ from scipy.spatial.transform import Rotation
 
 import pnu
 from pnu.data import shapes
-from pnu.data.scanner import KINDS, Scanner
+from pnu.data.scanner import KINDS, DepthCamera, Scanner
 from pnu.geometry.cloud_normals import FROM_ABOVE, ONE_SIDE, settled_normals, sight_by_places
 from pnu.geometry.mesh_sampling import sample_poisson_disk
 from pnu.geometry.single_view import camera_place, is_camera, seen_from_one_side, single_view
+from pnu.geometry.sphere_directions import sphere_directions
 from pnu.io.sensor import Sight
 
 Array = NDArray[np.float64]
@@ -156,6 +157,16 @@ def test_the_place_of_a_camera_is_found(name: str, seed: int) -> None:
     sight = sight_by_places(moved)
     assert sight is not None
     assert sight.words.startswith("towards a camera at ")
+
+
+@pytest.mark.parametrize("name", ["teapot", "dice", "walnut"])
+def test_the_camera_of_many_noisy_pixels_is_found(name: str) -> None:
+    camera = DepthCamera(half=0.42, across=330, down=330, noise=0.01, slant=0.1, step=0.004, torn=0.25)
+    sensor = 2.6 * sphere_directions(7, 0.3)[3]
+    scan = Scanner(shapes.make(name)).views(sensor[None], camera, np.random.default_rng(0))
+    place = camera_place(scan.points)
+    assert place is not None
+    assert np.linalg.norm(place - sensor) < 0.1 * np.linalg.norm(sensor)
 
 
 def test_a_camera_is_not_found_where_there_was_none() -> None:
