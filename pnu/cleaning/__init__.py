@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnu.cleaning.outliers import MANY, stray_points
-from pnu.geometry.anisotropy import averaged, thinned_lines
+from pnu.geometry.anisotropy import averaged, mean_normals, thinned_lines
 from pnu.geometry.cloud_normals import (
     Settled,
     camera_sight,
@@ -19,6 +19,7 @@ from pnu.geometry.cloud_normals import (
 from pnu.geometry.noise_level import noise_level
 from pnu.geometry.single_view import camera_place
 from pnu.geometry.spacing import spacing
+from pnu.geometry.thick_layers import LayerMeans, layer_means, layer_noise
 from pnu.io import Cloud
 from pnu.io.cloud import chosen
 from pnu.io.scan_columns import scan_numbers
@@ -68,26 +69,29 @@ class Cleaned(NamedTuple):
 
 
 def clean_cloud(
-    cloud: Cloud, *, outliers: Treatment = "auto", lines: Treatment = "auto", signs: Treatment = "auto",
-    doubts: Doubts | None = None,
+    cloud: Cloud, *, outliers: Treatment = "auto", lines: Treatment = "auto", noise: Treatment = "auto",
+    signs: Treatment = "auto", doubts: Doubts | None = None,
 ) -> Cleaned:  # fmt: skip
-    """A cloud without stray points (`outliers`), with lines thinned out (`lines`) and normals that agree (`signs`).
+    """A cloud without stray points (`outliers`), with lines thinned out (`lines`), layers of noise averaged (`noise`)
+    and normals that agree (`signs`).
 
     Lines are found where points are several times as dense along one direction as across it. As many points stay as lie
     about as far apart along lines as across; each moves to the mean of the points that it stands for, which takes most
-    of the noise from them. Lines with normals stay as they are: then nothing is to be estimated from neighbors.
+    of the noise from them. Lines with normals stay as they are: then nothing is to be estimated from neighbors. Where
+    noise is wider than the spacing, means about as far apart as it is wide take the place of the points.
 
     Args:
         cloud: as `pnu.io.check_cloud` gives it.
         outliers: auto: stray points are taken out; keep: all stay.
         lines: auto: thinned out; keep: as they are.
+        noise: auto: points of a layer thicker than their spacing are averaged; keep: they stay.
         signs: auto: of normals that contradict each other the axes are kept and the sides chosen anew; keep: as given.
         doubts: says, where signs are auto, of which normals the sides alone count (`with_axes_anew`); None: of none.
 
     Raises:
         ValueError: a treatment is neither auto nor keep, or hardly a point is none of the stray ones.
     """
-    for name, value in (("outliers", outliers), ("lines", lines), ("signs", signs)):
+    for name, value in (("outliers", outliers), ("lines", lines), ("noise", noise), ("signs", signs)):
         if value not in TREATMENTS:
             raise ValueError(f"{name}={value}: expected auto or keep")
     given, camera = cloud, camera_place(cloud.points) if cloud.normals is None else None
@@ -103,11 +107,14 @@ def clean_cloud(
         cloud = cloud._replace(normals=settled.normals)
     found = Cleaned(cloud._replace(notes=tuple(notes)), stray, camera=camera)
     if cloud.normals is None:
-        return _with_character(found, lines)
+        return _with_character(found, lines, noise)
     why = "" if doubts is None or signs == "keep" else doubts(cloud.points, cloud.normals)
     if why and (bare := without_normals(given, why)) is not None:
-        return clean_cloud(bare, outliers=outliers, lines=lines)
-    return with_axes_anew(found, why, lines=lines) if why else found
+        return clean_cloud(bare, outliers=outliers, lines=lines, noise=noise)
+    if why:
+        return with_axes_anew(found, why, lines=lines, noise=noise)
+    level = layer_noise(cloud.points) if noise == "auto" else None
+    return found if level is None else found._replace(cloud=_layer_averaged(found.cloud, level))
 
 
 def without_normals(cloud: Cloud, why: str) -> Cloud | None:
@@ -118,14 +125,14 @@ def without_normals(cloud: Cloud, why: str) -> Cloud | None:
     return cloud._replace(normals=None, notes=(*cloud.notes, axes_anew(cloud.normals, why)))
 
 
-def with_axes_anew(found: Cleaned, why: str, *, lines: Treatment = "auto") -> Cleaned:
+def with_axes_anew(found: Cleaned, why: str, *, lines: Treatment = "auto", noise: Treatment = "auto") -> Cleaned:
     """A clean cloud whose normals are taken for their sides alone: as one without, but that their sides are known.
 
     Where no sensor says the sides (`found.seen`) the shape may (`normals_on_sides`).
     """
     assert found.cloud.normals is not None
     notes = (*found.cloud.notes, axes_anew(found.cloud.normals, why))
-    return _with_character(found._replace(cloud=found.cloud._replace(notes=notes)), lines)
+    return _with_character(found._replace(cloud=found.cloud._replace(notes=notes)), lines, noise)
 
 
 def axes_anew(normals: NDArray[np.float64], why: str) -> str:
@@ -136,16 +143,20 @@ def axes_anew(normals: NDArray[np.float64], why: str) -> str:
     )
 
 
-def _with_character(found: Cleaned, lines: Treatment) -> Cleaned:
-    """A cloud without normals, or with such as tell the sides alone, with lines thinned out: what it is like."""
+def _with_character(found: Cleaned, lines: Treatment, noise: Treatment) -> Cleaned:
+    """A cloud without normals, or with such as tell the sides alone, lines thinned out and layers averaged: what it is
+    like."""
     cloud, notes = found.cloud, found.cloud.notes
     rows = thinned_lines(cloud.points) if lines == "auto" else None
     if rows is not None:
         note = f"lies in lines: {len(rows)} points, less dense along them, stand for {len(cloud.points)} (lines=keep)"
         cloud = chosen(cloud, rows)._replace(points=averaged(cloud.points, rows), notes=(*notes, note))
+    level = layer_noise(cloud.points) if noise == "auto" and rows is None else None
+    if level is not None:
+        cloud = _layer_averaged(cloud, level)
     share = len(found.stray) / (len(found.stray) + len(cloud.points))
-    known = None  # what is fitted to lines has no sides either
-    if cloud.normals is not None and rows is None:
+    known = None  # what is fitted to lines, or within a layer, has no sides either
+    if cloud.normals is not None and rows is None and level is None:
         known = normals_on_sides(cloud.points, cloud.normals, sure=found.seen)
     if known is not None and known.words:
         cloud = cloud._replace(notes=(*cloud.notes, f"normals: {known.words} (normals=keep)"))
@@ -159,6 +170,25 @@ def _with_character(found: Cleaned, lines: Treatment) -> Cleaned:
     if is_noisy(cloud.points, estimated.normals):
         return found._replace(character=noisy_character(cloud.points), estimated=estimated)
     return scanned._replace(estimated=estimated)
+
+
+def layer_words(layer: LayerMeans, count: int) -> str:
+    """A line on a layer of so many points that means stand for."""
+    return (
+        f"noise of about {layer.noise:.2g}, more than the spacing: {len(layer.points)} means stand for {count} points "
+        "(noise=keep)"
+    )
+
+
+def _layer_averaged(cloud: Cloud, noise: float) -> Cloud:
+    """Means in place of a layer of so much noise, with mean normals where there are any."""
+    layer = layer_means(cloud.points, noise)
+    found = chosen(cloud, layer.rows)._replace(
+        points=layer.points, notes=(*cloud.notes, layer_words(layer, len(cloud.points)))
+    )
+    if cloud.normals is None:
+        return found
+    return found._replace(normals=mean_normals(cloud.points, layer.rows, cloud.normals))
 
 
 def noisy_character(points: NDArray[np.float64]) -> Character:

@@ -38,13 +38,13 @@ def check_sides(cfg: Any) -> None:
 def sided(cfg: Any, cloud: "Cloud", *, learned: bool = True, places: "Sight | None" = None) -> "Settled":
     """A normal for each point of a cloud, as the keys and the file say. Without `learned` those that are estimated are
     plane fits. places: what those of the points say, where that is known already."""
-    from pnu.geometry.cloud_normals import settled_normals
+    from pnu.geometry.cloud_normals import settled_normals, settled_through_noise
     from pnu.io.scan_columns import scan_numbers
     from pnu.io.sensor import asked_sight, sight_of
     from pnu.upsamplers.learned_normals import learned_normals
 
     with stages(cfg.quiet) as progress:
-        return settled_normals(
+        return (settled_through_noise if learned else settled_normals)(
             cloud.points,
             cloud.normals,
             choice=cfg.normals,
@@ -84,7 +84,9 @@ def with_good_axes(cfg: Any, cloud: "Cloud", settled: "Settled") -> tuple["Settl
     return settled._replace(normals=found), f"{note}; {sides.words}" if sides.words else note
 
 
-def cleaned(cfg: Any, cloud: "Cloud", *, outliers: Any = "auto", lines: Any = "auto") -> tuple["Cleaned", "Cloud"]:
+def cleaned(
+    cfg: Any, cloud: "Cloud", *, outliers: Any = "auto", lines: Any = "auto", noise: Any = "auto"
+) -> tuple["Cleaned", "Cloud"]:
     """A cloud as `clean_cloud` leaves it, and the same with a normal for each point, its own or rough estimates.
 
     Where keys or file say more of the side of normals than the shape of the cloud does, they decide it. With
@@ -99,7 +101,7 @@ def cleaned(cfg: Any, cloud: "Cloud", *, outliers: Any = "auto", lines: Any = "a
     places = sight_by_places(cloud.points)
     told = told or sight_of(cfg.input, cloud.attributes) is not None or places is not None
     signs: Any = "keep" if told or cfg.normals == "keep" else "auto"
-    found = clean_cloud(cloud, outliers=outliers, lines=lines, signs=signs, doubts=poor_axes)
+    found = clean_cloud(cloud, outliers=outliers, lines=lines, noise=noise, signs=signs, doubts=poor_axes)
     own = found.cloud.normals is not None
     if own and not told:
         return found, found.cloud
@@ -114,7 +116,8 @@ def cleaned(cfg: Any, cloud: "Cloud", *, outliers: Any = "auto", lines: Any = "a
     if not why:
         return found, whole
     if (bare := without_normals(cloud, why)) is not None:
-        return cleaned(cfg, bare, outliers=outliers, lines=lines)
-    found = with_axes_anew(found, why, lines=lines)
-    settled = found.estimated or sided(cfg, found.cloud, learned=False, places=places)
+        return cleaned(cfg, bare, outliers=outliers, lines=lines, noise=noise)
+    found = with_axes_anew(found, why, lines=lines, noise="keep")  # which is averaged already
+    known = found.estimated is not None and (not told or found.estimated.seen)
+    settled = (found.estimated if known else None) or sided(cfg, found.cloud, learned=False, places=places)
     return found._replace(estimated=settled), found.cloud._replace(normals=settled.normals)

@@ -85,7 +85,7 @@ def read_and_clean(scan: str, keys: Mapping[str, Any]) -> tuple["Cloud", "Cleane
     given = [override(key, value) for key, value in ({"input": scan, "output": "dense.ply"} | dict(keys)).items()]
     cfg = compose_config(Upsample, given)
     before = io.read_cloud(scan, normals=cfg.normals != "estimate", columns=cfg.columns)
-    cleaned, cloud = _sides.cleaned(cfg, before, outliers=cfg.outliers, lines=cfg.lines)
+    cleaned, cloud = _sides.cleaned(cfg, before, outliers=cfg.outliers, lines=cfg.lines, noise=cfg.noise)
     return before, cleaned._replace(cloud=cloud)
 
 

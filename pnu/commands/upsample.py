@@ -55,6 +55,9 @@ class Upsample:
     sample: int | None = doc("of a mesh: as many points on its faces, with their normals; null: its vertices")
     outliers: str = doc("auto: stray points, which lie off the surface, are taken out first; keep: all stay")
     lines: str = doc("auto: scan lines, dense along and sparse across, are thinned out first; keep: they stay")
+    noise: str = doc(
+        "auto: where points lie in a layer thicker than their spacing, means take their place; keep: they stay"
+    )
     holes: float | None = doc(_filled.HOLES)
     removed: str | None = doc("file for the points that were taken out; null: none is written")
     memory: str | None = doc(_tiles.MEMORY)
@@ -114,7 +117,8 @@ def upsample(cfg: Any) -> None:
     wanted = cfg.ratio if cfg.spacing is None else whole_clouds.ratio_of_spacing(cloud.points, cfg.spacing)
     count, before = whole_clouds.output_count(len(cloud.points), wanted), cloud
     keep = {"true": True, "false": False}.get(str(cfg.keep).lower(), cfg.keep)
-    cleaned, cloud = _sides.cleaned(cfg, cloud, outliers=cfg.outliers, lines="keep" if keep is True else cfg.lines)
+    lines, noise = ("keep", "keep") if keep is True else (cfg.lines, cfg.noise)
+    cleaned, cloud = _sides.cleaned(cfg, cloud, outliers=cfg.outliers, lines=lines, noise=noise)
     for note in cloud.notes[len(before.notes) :]:
         say(f"        {note}")
     if cfg.removed is not None:

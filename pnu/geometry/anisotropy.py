@@ -42,6 +42,22 @@ def thinned_lines(points: NDArray[np.float64]) -> NDArray[np.int64] | None:
 
 def averaged(points: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.float64]:
     """Points (m, 3) in place of those of the rows (m,): each the mean of all points (n, 3) that are nearest to it."""
+    return means_around(points, rows, points)
+
+
+def means_around(
+    points: NDArray[np.float64], rows: NDArray[np.int64], values: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The mean of the values (n, d) of all points (n, 3) that are nearest to each of the rows (m,): (m, d)."""
     owner = PointTree(points[rows]).nearest(points, 1)[1][:, 0]
-    total = np.stack([np.bincount(owner, axis, len(rows)) for axis in points.T], 1)
+    total = np.stack([np.bincount(owner, axis, len(rows)) for axis in values.T], 1)
     return total / np.bincount(owner, minlength=len(rows))[:, None]
+
+
+def mean_normals(
+    points: NDArray[np.float64], rows: NDArray[np.int64], normals: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Unit normals (m, 3) by those, (n, 3), of all points that are nearest to each of the rows (m,); NaN: none has."""
+    mean = means_around(points, rows, np.nan_to_num(normals))
+    length = np.linalg.norm(mean, axis=1, keepdims=True)
+    return np.where(length > 0, mean / np.maximum(length, 1e-300), np.nan)

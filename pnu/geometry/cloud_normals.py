@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -11,8 +11,10 @@ from pnu.geometry.flipped_parts import flipped_share
 from pnu.geometry.normal_estimation import complete_normals, orient_normals, refit_normals
 from pnu.geometry.normal_sides import hidden, largest_piece, repaired_signs, seen_signs
 from pnu.geometry.orientation import NeighborCloud, gauss_law
+from pnu.geometry.point_tree import PointTree
 from pnu.geometry.scanner_within import scanner_within
 from pnu.geometry.single_view import camera_place, is_camera, seen_from_one_side
+from pnu.geometry.thick_layers import layer_means, layer_noise
 from pnu.geometry.unit_sphere import unit_sphere_frame
 from pnu.io.sensor import Sight
 from pnu.runtime.progress import Progress, silent
@@ -107,6 +109,39 @@ def settled_normals(
     settled[order] = lines * sign[:, None]
     words = _words(known, int((sign[known] < 0).sum()), why, side + doubt)
     return Settled(settled, words, side, seen=sight is not None)
+
+
+def settled_through_noise(
+    points: np.ndarray,
+    normals: np.ndarray | None,
+    *,
+    asked: Sight | None = None,
+    found: Sight | None = None,
+    scans: np.ndarray | None = None,
+    **options: Any,
+) -> Settled:
+    """As `settled_normals`; but where points (n, 3) without normals lie in a layer thicker than their spacing, each has
+    the normal of the nearest of the means that stand for them (`pnu.geometry.thick_layers`)."""
+    bare = normals is None or options.get("choice") == "estimate"
+    noise = layer_noise(points) if bare else None
+    if noise is None:
+        return settled_normals(points, normals, asked=asked, found=found, scans=scans, **options)
+    means = layer_means(points, noise)
+    found = found or sight_by_places(points)  # which means do not tell any more
+    asked, found = (_of_rows(sight, means.rows) for sight in (asked, found))
+    some = None if scans is None else scans[means.rows]
+    settled = settled_normals(means.points, None, asked=asked, found=found, scans=some, **options)
+    nearest = PointTree(means.points).nearest(points, 1)[1][:, 0]
+    _, separator, side = settled.words.partition("; side: ")
+    words = f"{len(points)} estimated, by {len(means.rows)} means, as noise is wider than the spacing{separator}{side}"
+    return settled._replace(normals=settled.normals[nearest], words=words)
+
+
+def _of_rows(sight: Sight | None, rows: np.ndarray) -> Sight | None:
+    """What decides the side of some of the points."""
+    if sight is None or sight.viewpoint is None or sight.viewpoint.ndim == 1:
+        return sight
+    return sight._replace(viewpoint=sight.viewpoint[rows])
 
 
 def normals_on_sides(points: np.ndarray, normals: np.ndarray, *, sure: bool = False) -> Settled:

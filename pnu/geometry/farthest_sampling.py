@@ -33,6 +33,13 @@ def farthest_points_large(points: NDArray[np.floating], m: int, *, step: Step = 
     return farthest_in_blocks(single_precision(points), m, farthest_apart, threads=threads, size=LARGE_BLOCK, step=step)
 
 
+def thinned_to(points: NDArray[np.float64], distance: float) -> NDArray[np.int64]:
+    """Rows of those of the points (n, 3), ascending, that farthest points take down to a distance between them."""
+    single, few = single_precision(points), min(len(points), 16)
+    order, _ = farthest_apart(single, len(points), least=distance)
+    return np.sort(order if len(order) >= few else farthest_order(single, few, 0))
+
+
 def single_precision(points: NDArray[np.floating]) -> NDArray[np.float32]:
     """Points (n, 3), those in float64 about their mean: map coordinates, say, lose their detail in float32."""
     points = np.asarray(points)

@@ -48,6 +48,12 @@ def noise_level(points: NDArray[np.floating], normals: NDArray[np.floating] | No
 
 def _residuals(near: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
     """Root mean square distance of points (m, k, 3) from their best quadratic height field, (m,), or infinity."""
+    square, total = (weight * height_residuals(near, weight) ** 2).sum(1), weight.sum(1)
+    return np.sqrt(np.where(total > 9, square / np.maximum(total - 6, 1), np.inf))
+
+
+def height_residuals(near: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Heights of points (m, k, 3) over their best quadratic height field, to which each adds by its weight: (m, k)."""
     total, weight = weight.sum(1), weight[..., None]
     near = near - (weight * near).sum(1, keepdims=True) / total[:, None, None]
     height, u, v = np.moveaxis(near @ np.linalg.eigh(near.swapaxes(1, 2) @ (weight * near))[1], -1, 0)
@@ -56,5 +62,5 @@ def _residuals(near: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArra
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], -1)
     normal = terms.swapaxes(1, 2) @ (weight * terms) + 1e-9 * np.eye(6)
     fit = terms @ np.linalg.solve(normal, (weight * terms).swapaxes(1, 2) @ height[..., None])
-    square = (weight[..., 0] * (height - fit[..., 0]) ** 2).sum(1)
-    return np.sqrt(np.where(total > 9, square / np.maximum(total - 6, 1), np.inf))
+    residual: NDArray[np.float64] = height - fit[..., 0]
+    return residual

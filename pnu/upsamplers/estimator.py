@@ -53,6 +53,7 @@ class PointCloudUpsampler:
         keep: bool | Literal["auto"] = "auto",
         outliers: Treatment = "auto",
         lines: Treatment = "auto",
+        noise: Treatment = "auto",
         signs: Treatment = "auto",
         holes: float | None = None,
         device: str = "auto",
@@ -63,7 +64,7 @@ class PointCloudUpsampler:
     ) -> None:
         self.ratio, self.spacing, self.model, self.patch_size = ratio, spacing, model, patch_size
         self.merge, self.density, self.keep, self.holes = merge, density, keep, holes
-        self.outliers, self.lines, self.signs = outliers, lines, signs
+        self.outliers, self.lines, self.noise, self.signs = outliers, lines, noise, signs
         self.device, self.devices, self.batch_size = device, devices, batch_size
         self.seed, self.progress = seed, progress
 

@@ -36,6 +36,7 @@ from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.normal_estimation import complete_normals
 from pnu.geometry.point_tree import PointTree
 from pnu.geometry.spacing import local_spacing
+from pnu.geometry.thick_layers import layer_means, layer_noise
 from pnu.io import atomic_path, read_json, write_json
 from pnu.io.cloud import ORIGIN, UNSEEN, Cloud, first_of_each_place, looks_geographic, unit_normals
 from pnu.io.fields import GEOGRAPHIC, as_colors
@@ -69,6 +70,7 @@ class Keys(NamedTuple):
     columns: str | None
     outliers: str
     lines: str
+    noise: str
     run: str
 
 
@@ -93,6 +95,8 @@ class Facts:
     attributes: list[str] = field(default_factory=list)
     lined: float | None = None
     """Distance to which points in lines are thinned out; None: there are no lines."""
+    layered: float | None = None
+    """Noise of points in a layer thicker than their spacing, which are averaged; None: there is no such layer."""
     smooth: bool = False
     """Whether points are noisy beside their spacing, and smoothed first."""
     keep: bool = False
@@ -391,7 +395,10 @@ def _decided(folder: Path, keys: Keys, facts: Facts, progress: Progress) -> None
     if most("lined") and keys.lines == "auto" and keys.keep is not True and not facts.trusted:
         facts.lined = middle("lined")
         facts.given = False  # what is fitted to lines has no sides either
-    facts.apart = max(look["apart"] if facts.lined else look["apart_raw"] for look in found)
+    elif most("layered") and keys.noise == "auto" and keys.keep is not True:
+        facts.layered = middle("layered")
+        facts.given = facts.trusted and not most("turned")
+    facts.apart = max(look["apart" if facts.lined or facts.layered else "apart_raw"] for look in found)
     facts.smooth = most("noisy")
     facts.heights = most("heights")
     stray = float(weight @ np.array([look["stray"] for look in found])) / weight.sum()
@@ -428,6 +435,11 @@ def _look(points: np.ndarray, normals: np.ndarray | None, keys: Keys, size: int)
     if thinned is not None:
         points, known = points[thinned], None if known is None else known[thinned]
         look["lined"] = float(np.quantile(PointTree(points).among_themselves(2)[0][:, 0], 0.02))
+    noise = layer_noise(points, BLOCK // 2) if thinned is None else None
+    look["layered"] = noise
+    if noise is not None:
+        means = layer_means(points, noise, SMALLEST)
+        points, known = means.points, None if known is None or look["poor"] else known[means.rows]
     look["apart"] = float(np.quantile(local_spacing(points), 0.9))
     known = settled_normals(points, None).normals if known is None else known
     scale = np.abs(points - points.mean(0)).max()

@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnu.cleaning import stray_points
-from pnu.geometry.anisotropy import averaged
+from pnu.geometry.anisotropy import averaged, mean_normals
 from pnu.geometry.cloud_normals import normals_on_sides
 from pnu.geometry.even_spacing import RANK, tangent_discs
-from pnu.geometry.farthest_sampling import farthest_apart, farthest_order, single_precision
+from pnu.geometry.farthest_sampling import thinned_to
 from pnu.geometry.normal_estimation import complete_normals
 from pnu.geometry.normal_sides import seen_signs, voted_signs
 from pnu.geometry.point_tree import PointTree
+from pnu.geometry.thick_layers import layer_means
 from pnu.geometry.unit_sphere import Frame, unit_sphere_frame
 from pnu.io import atomic_path, read_json, write_json
 from pnu.io.sensor import asked_sight
@@ -104,9 +105,13 @@ def prepared(plan: Plan, number: int) -> None:
     rows = rows[~stray]
     if facts.lined is not None and len(rows) > SMALLEST:
         kept = thinned_to(rows["point"], facts.lined)
-        moved = averaged(rows["point"], kept)
-        rows = rows[kept]
-        rows["point"] = moved
+        rows = _in_place(rows, kept, averaged(rows["point"], kept))
+    elif facts.layered is not None and len(rows) > SMALLEST:
+        means = layer_means(rows["point"], facts.layered, SMALLEST)
+        turned = mean_normals(rows["point"], means.rows, rows["normal"]) if facts.given else None
+        rows = _in_place(rows, means.rows, means.points)
+        if turned is not None:
+            rows["normal"] = turned
     rows = rows[np.lexsort(rows["point"].T)]
     points = rows["point"]
     if len(rows) < SMALLEST:  # a few points in the air
@@ -130,11 +135,11 @@ def prepared(plan: Plan, number: int) -> None:
     write_json(plan.path("share", number, ".json"), share._asdict())
 
 
-def thinned_to(points: NDArray[np.float64], distance: float) -> NDArray[np.int64]:
-    """Rows of those of the points (n, 3), ascending, that farthest points take down to a distance between them."""
-    single, few = single_precision(points), min(len(points), 16)
-    order, _ = farthest_apart(single, len(points), least=distance)
-    return np.sort(order if len(order) >= few else farthest_order(single, few, 0))
+def _in_place(rows: NDArray[Any], kept: NDArray[np.int64], points: NDArray[np.float64]) -> NDArray[Any]:
+    """Those of the rows (n,) that are kept (m,), at other points (m, 3)."""
+    found = rows[kept]
+    found["point"] = points
+    return found
 
 
 def _normals(plan: Plan, rows: NDArray[Any]) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ import numpy as np
 from pnu import __version__
 from pnu.cleaning import Character, Cleaned, Treatment, clean_cloud
 from pnu.geometry.attributes import carry
-from pnu.geometry.cloud_normals import check_not_a_line, settled_normals
+from pnu.geometry.cloud_normals import check_not_a_line, settled_normals, settled_through_noise
 from pnu.geometry.cloud_statistics import FAINT
 from pnu.geometry.normal_estimation import complete_normals
 from pnu.geometry.point_tree import PointTree
@@ -67,6 +67,7 @@ def upsample(
     keep: bool | Literal["auto"] = "auto",
     outliers: Treatment = "auto",
     lines: Treatment = "auto",
+    noise: Treatment = "auto",
     signs: Treatment = "auto",
     holes: float | None = None,
     device: str = "auto",
@@ -92,6 +93,7 @@ def upsample(
     keep: bool | Literal["auto"] = "auto",
     outliers: Treatment = "auto",
     lines: Treatment = "auto",
+    noise: Treatment = "auto",
     signs: Treatment = "auto",
     holes: float | None = None,
     device: str = "auto",
@@ -116,6 +118,7 @@ def upsample(
     keep: bool | Literal["auto"] = "auto",
     outliers: Treatment = "auto",
     lines: Treatment = "auto",
+    noise: Treatment = "auto",
     signs: Treatment = "auto",
     holes: float | None = None,
     device: str = "auto",
@@ -154,6 +157,8 @@ def upsample(
             spread and show no noise.
         outliers: "auto": stray points are taken out first, and not counted less for it: n stays; "keep": none is.
         lines: "auto": scan lines, dense along and sparse across, are thinned out first; "keep": they stay.
+        noise: "auto": where points lie in a layer thicker than their spacing, means take their place; "keep": they
+            stay, and are only smoothed.
         signs: "auto": where given normals contradict each other, their axes are kept and their sides chosen anew; where
             they are poor, as planes fitted to neighbors are, their sides are kept and their axes found anew; "keep":
             they are taken as they are.
@@ -192,8 +197,9 @@ def upsample(
     given = check_cloud(Cloud(*_taken(points, normals, kind, expected, (3, 6))), "points", minimum=MINIMUM)
     count = output_count(len(given.points), ratio if spacing is None else ratio_of_spacing(given.points, spacing))
     options = Densification(patch_size, merge, density, keep, holes, devices, batch_size, seed)
-    lines = "keep" if keep is True else lines
-    cleaned = clean_cloud(given, outliers=outliers, lines=lines, signs=signs, doubts=poor_axes)
+    if keep is True:
+        lines = noise = "keep"
+    cleaned = clean_cloud(given, outliers=outliers, lines=lines, noise=noise, signs=signs, doubts=poor_axes)
     found = densified(cleaned, count, options, model=model, device=device, progress=progress, parts=parts)
     given = cleaned.cloud
     if kind is not None:
@@ -443,7 +449,7 @@ def normals(
         raise ValueError(
             f"neighbors={neighbors}: expected a whole number from 3 to {len(cloud.points)}, the different points"
         )
-    settled = settled_normals(
+    settled = settled_through_noise(
         cloud.points,
         cloud.normals,
         asked=asked,

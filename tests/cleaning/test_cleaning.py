@@ -92,6 +92,52 @@ def lines(across: int = 24, along: int = 240, noise: float = 0.0) -> np.ndarray:
     return np.stack([u.ravel(), v.ravel(), noise * np.random.default_rng(0).standard_normal(u.size)], 1)
 
 
+def thick_sphere(n: int, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points around the unit sphere, and the true ones."""
+    rng = np.random.default_rng(0)
+    true = rng.normal(size=(n, 3))
+    true /= np.linalg.norm(true, axis=1, keepdims=True)
+    return true + noise * rng.normal(size=true.shape), true
+
+
+@pytest.mark.slow
+def test_a_layer_of_noise_becomes_a_surface() -> None:
+    points, true = thick_sphere(60000, 0.02)
+    cleaned = clean_cloud(Cloud(points, None, {}))
+    assert " means stand for " in cleaned.cloud.notes[-1]
+    assert cleaned.character == "noisy"
+    dense = pnu.upsample(points, ratio=1)
+    assert len(dense) == 60000
+    radius = np.linalg.norm(dense[:, :3], axis=1)
+    assert np.abs(radius - 1).mean() < 0.002  # 0.0035 with noise=keep
+    cosine = (dense[:, :3] / radius[:, None] * dense[:, 3:]).sum(1)
+    assert (cosine < 0).mean() < 0.001  # 0.08 with noise=keep
+    assert np.degrees(np.arccos(np.abs(cosine).clip(0, 1))).mean() < 2  # 3.7
+    normals = pnu.normals(points)
+    assert normals.shape == points.shape
+    assert ((normals * true).sum(1) > 0.9).mean() > 0.99
+
+
+def test_a_layer_of_noise_may_stay() -> None:
+    points, _ = thick_sphere(12000, 0.05)
+    means = clean_cloud(Cloud(points, None, {}), outliers="keep")
+    assert len(means.cloud.points) < 10000
+    assert "means stand for 12000 points (noise=keep)" in means.cloud.notes[-1]
+    kept = clean_cloud(Cloud(points, None, {}), outliers="keep", noise="keep")
+    np.testing.assert_array_equal(kept.cloud.points, points)
+    with pytest.raises(ValueError, match="noise=never: expected auto or keep"):
+        clean_cloud(Cloud(points, None, {}), noise="never")  # type: ignore[arg-type]
+
+
+def test_a_layer_with_normals_keeps_their_means() -> None:
+    points, true = thick_sphere(20000, 0.05)
+    found = clean_cloud(Cloud(points, true, {})).cloud
+    assert found.normals is not None
+    assert len(found.points) < 12000
+    assert (found.normals * found.points).sum(1).min() > 0.9 * 0.8
+    np.testing.assert_allclose(np.linalg.norm(found.normals, axis=1), 1)
+
+
 def test_lines_are_thinned_to_their_distance() -> None:
     points = lines()
     assert evenness(points) < 0.2 < 0.5 < evenness(sphere(2000))

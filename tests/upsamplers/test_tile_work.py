@@ -18,7 +18,7 @@ from pnu.upsamplers.tile_plan import Keys, Plan, planned
 from pnu.upsamplers.tile_seams import evened_out, exactly
 from pnu.upsamplers.whole_clouds import output_count, ratio_of_spacing, upsample
 
-KEYS = Keys("", 2.5, None, "auto", False, "auto", None, None, None, None, "auto", "auto", "surface")
+KEYS = Keys("", 2.5, None, "auto", False, "auto", None, None, None, None, "auto", "auto", "auto", "surface")
 
 
 def sheet(n: int, seed: int = 0) -> np.ndarray:
@@ -192,6 +192,20 @@ def test_lines_strays_and_attributes(tmp_path: Path) -> None:
     assert len(dense) == len(points)
     assert np.abs(dense[:, 2]).max() < 1  # the stray one is gone
     assert tile_work.whole_of(plan).tiles[plan.cells.of_points(points[-1:])[0]].stray == 1
+
+
+@pytest.mark.slow
+def test_a_layer_of_noise_is_averaged(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(0, 20, (24000, 2)), 0.2 * rng.normal(size=24000)])  # 1.5 spacings
+    plan = plan_of(tmp_path, points, 13000, ratio=1)
+    assert len(plan.tiles) == 2
+    assert plan.facts.layered
+    dense = make(plan)
+    assert len(dense) == len(points)
+    whole = upsample(points, ratio=1)
+    assert np.abs(dense[:, 2]).mean() < 1.1 * np.abs(whole[:, 2]).mean()
+    assert (np.abs(dense[:, 5]) > 0.9).mean() > 0.98
 
 
 def test_density_follows_as_without_tiles(tmp_path: Path) -> None:
