@@ -34,7 +34,7 @@ class LayerMeans(NamedTuple):
     """Points in place of a thick layer."""
 
     points: NDArray[np.float64]  # (m, 3)
-    rows: NDArray[np.int64]  # (m,) of the points that they stand for, ascending
+    rows: NDArray[np.int64]  # (m,) of points that they stand for
     noise: float  # standard deviation of the points across the surface
 
 
@@ -66,14 +66,15 @@ def layer_means(points: NDArray[np.float64], noise: float, least: int = LEFT) ->
     """Means of the points (n, 3) of a layer of so much noise, in any order, about as far apart as it is thick, if that
     leaves as many as `least`."""
     order = np.lexsort(points.T)
-    chosen, _ = farthest_apart(single_precision(points[order]), len(points), least=APART * noise)
+    points = points[order]
+    chosen, _ = farthest_apart(single_precision(points), len(points), least=APART * noise)
     if len(chosen) < min(least, len(points)):
-        chosen = farthest_points_large(points[order], min(least, len(points)))
-    rows = np.sort(order[chosen])
+        chosen = farthest_points_large(points, min(least, len(points)))
+    rows = np.sort(chosen)
     stand_for = np.bincount(PointTree(points[rows]).nearest(points, 1)[1][:, 0], minlength=len(rows))
     rows = rows[stand_for >= LONELY * np.median(stand_for)]
     means, tree = averaged(points, rows), PointTree(points)
     around = tree.nearest(means[:: -(-len(means) // PLACES)], min(MOST, len(points)), threads=thread_count())[0]
     k = max(FEW, int(np.median((around < NEAR * noise).sum(1))))  # cells are thinner than the layer, balls as thick
     means = points[tree.nearest(means, k, threads=thread_count())[1]].mean(1)
-    return LayerMeans(means, rows, noise)
+    return LayerMeans(means, order[rows], noise)
