@@ -3,7 +3,8 @@
 Each mesh of the folder, brought to the unit sphere, is scanned in every way of `pnu.data.scanner`; each method makes a
 cloud of four times as many points of the scan. "pnu" is `pnu.upsample` as it is called by default; "pnu, as it is" the
 same without cleaning; "open3d" what users of Open3D do: statistical outlier removal, normals, consistent tangent
-planes, Poisson, the least dense 3 % trimmed, Poisson-disk samples. The clouds go to OUTPUT/METHOD/SHAPE_KIND.ply.
+planes, Poisson, the least dense 3 % trimmed, Poisson-disk samples. The clouds go to OUTPUT/METHOD/SHAPE_KIND.ply,
+the scans to OUTPUT/scans.
 """
 
 import argparse
@@ -31,7 +32,7 @@ def pnu_default(scan: SimulatedScan) -> np.ndarray:
 
 
 def pnu_as_it_is(scan: SimulatedScan) -> np.ndarray:
-    return upsample(scan.points, scan.normals, outliers="keep", lines="keep", density="even", keep=False)
+    return upsample(scan.points, scan.normals, outliers="keep", lines="keep", noise="keep", density="even", keep=False)
 
 
 def open3d_default(scan: SimulatedScan) -> np.ndarray:
@@ -60,6 +61,8 @@ def main() -> None:
         for kind in arguments.kinds:
             scan = KINDS[kind](scanner, generator(arguments.seed, name, kind))
             seen = seen_samples(truth, scan, kind)
+            (arguments.output / "scans").mkdir(parents=True, exist_ok=True)
+            write_cloud(arguments.output / "scans" / f"{name}_{kind}.ply", scan.points, scan.normals)
             for method in arguments.methods:
                 started = time.perf_counter()
                 dense = METHODS[method](scan)

@@ -16,6 +16,7 @@ from pnu.geometry.cloud_normals import (
     normals_on_sides,
     settled_normals,
 )
+from pnu.geometry.depth_steps import depth_steps, smoothed_within_steps, steps_words
 from pnu.geometry.noise_level import noise_level
 from pnu.geometry.single_view import camera_place
 from pnu.geometry.spacing import spacing
@@ -72,19 +73,20 @@ def clean_cloud(
     cloud: Cloud, *, outliers: Treatment = "auto", lines: Treatment = "auto", noise: Treatment = "auto",
     signs: Treatment = "auto", doubts: Doubts | None = None,
 ) -> Cleaned:  # fmt: skip
-    """A cloud without stray points (`outliers`), with lines thinned out (`lines`), layers of noise averaged (`noise`)
-    and normals that agree (`signs`).
+    """A cloud without stray points (`outliers`), with lines thinned out (`lines`), layers of noise and steps of depth
+    made smooth (`noise`), and normals that agree (`signs`).
 
     Lines are found where points are several times as dense along one direction as across it. As many points stay as lie
     about as far apart along lines as across; each moves to the mean of the points that it stands for, which takes most
     of the noise from them. Lines with normals stay as they are: then nothing is to be estimated from neighbors. Where
-    noise is wider than the spacing, means about as far apart as it is wide take the place of the points.
+    noise is wider than the spacing, means about as far apart as it is wide take the place of the points; where depths
+    come in wider steps than that, points move within half a step of where they are.
 
     Args:
         cloud: as `pnu.io.check_cloud` gives it.
         outliers: auto: stray points are taken out; keep: all stay.
         lines: auto: thinned out; keep: as they are.
-        noise: auto: points of a layer thicker than their spacing are averaged; keep: they stay.
+        noise: auto: points of a layer thicker than their spacing are averaged, steps of depth smoothed; keep: all stay.
         signs: auto: of normals that contradict each other the axes are kept and the sides chosen anew; keep: as given.
         doubts: says, where signs are auto, of which normals the sides alone count (`with_axes_anew`); None: of none.
 
@@ -95,8 +97,14 @@ def clean_cloud(
         if value not in TREATMENTS:
             raise ValueError(f"{name}={value}: expected auto or keep")
     given, camera = cloud, camera_place(cloud.points) if cloud.normals is None else None
-    stray = np.flatnonzero(stray_points(cloud.points, camera)) if outliers == "auto" else np.empty(0, np.int64)
     notes = list(cloud.notes)
+    steps = depth_steps(cloud.points, camera) if noise == "auto" else None
+    if steps is not None:
+        notes.append(
+            f"{steps_words(steps)}: each point moved by half a step at most, onto the surface through them (noise=keep)"
+        )
+        cloud = cloud._replace(points=smoothed_within_steps(cloud.points, steps))
+    stray = np.flatnonzero(stray_points(cloud.points, camera)) if outliers == "auto" else np.empty(0, np.int64)
     if len(stray):
         how = "they lie off the surface" if camera is None else f"torn off at edges, as a {camera_words(camera)} saw"
         notes.append(f"{len(stray)} of {len(cloud.points)} points left out: stray, {how} (outliers=keep)")

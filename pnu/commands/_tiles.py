@@ -102,6 +102,8 @@ def upsample_in_tiles(cfg: Any, say: Say) -> None:
         say(f"        lies in lines: thinned out to {facts.lined:.3g} between points (lines=keep)")
     if facts.layered:
         say(f"        noise of about {facts.layered:.2g}, more than the spacing: means take their place (noise=keep)")
+    if facts.steps:
+        say(f"        steps of depth of about {facts.steps:.2g}: points moved within half of one (noise=keep)")
     if facts.turned:
         say(f"        normals: sides chosen anew, {facts.turned} (normals=keep)")
     if facts.poor:

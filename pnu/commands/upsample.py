@@ -56,7 +56,8 @@ class Upsample:
     outliers: str = doc("auto: stray points, which lie off the surface, are taken out first; keep: all stay")
     lines: str = doc("auto: scan lines, dense along and sparse across, are thinned out first; keep: they stay")
     noise: str = doc(
-        "auto: where points lie in a layer thicker than their spacing, means take their place; keep: they stay"
+        "auto: where points lie in a layer thicker than their spacing, means take their place, and steps of depth that "
+        "are as wide are smoothed; keep: they stay"
     )
     holes: float | None = doc(_filled.HOLES)
     removed: str | None = doc("file for the points that were taken out; null: none is written")

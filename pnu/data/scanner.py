@@ -40,7 +40,8 @@ class DepthCamera:
         down: rays along the second
         noise: standard deviation along the ray, at right angles to the surface; more at a slant
         slant: cosine of incidence below which nothing is seen
-        step: of depth; 0: none
+        step: of depth along the ray; 0: none
+        disparity: step of one over depth along the axis of the picture, as two eyes or a pattern measure it; 0: none
         turn: by which views are misaligned, standard deviation in degrees
         shift: the same in lengths
         torn: share of the points at edges of depth that float between front and background,
@@ -55,6 +56,7 @@ class DepthCamera:
     noise: float = 0.002
     slant: float = 0.3
     step: float = 0.0
+    disparity: float = 0.0
     turn: float = 0.0
     shift: float = 0.0
     torn: float = 0.0
@@ -145,6 +147,9 @@ class Scanner:
         measured = depth + camera.noise * rng.standard_normal(len(depth)) / np.maximum(slant, STEEPEST)
         if camera.step:
             measured = np.round(measured / camera.step) * camera.step
+        if camera.disparity:
+            ahead = rays @ (-sensor / np.linalg.norm(sensor))
+            measured = 1 / (np.round(1 / (measured * ahead) / camera.disparity) * camera.disparity * ahead)
         turn, shift = _rotation(rng, camera.turn), camera.shift * rng.standard_normal(3)
         clean = np.hstack([sensor + depth[:, None] * rays, normals])
         edge = np.flatnonzero(border)
@@ -178,6 +183,12 @@ def oneview(scanner: Scanner, rng: np.random.Generator) -> SimulatedScan:
     return scanner.views(2.6 * sphere_directions(7, random_turn(rng))[rng.integers(7)][None], camera, rng)
 
 
+def depth(scanner: Scanner, rng: np.random.Generator) -> SimulatedScan:
+    """One depth camera of many pixels that measures disparities: steps of depth two or three pixels wide."""
+    camera = DepthCamera(half=0.42, across=220, down=220, slant=0.1, disparity=0.005)
+    return scanner.views(2.6 * sphere_directions(7, random_turn(rng))[rng.integers(7)][None], camera, rng)
+
+
 def lines(scanner: Scanner, rng: np.random.Generator) -> SimulatedScan:
     """A laser from four places, ten times as dense along a line as across lines."""
     camera = DepthCamera(half=0.38, across=260, down=26, noise=0.0015, slant=0.12)
@@ -195,7 +206,7 @@ def flipped(scanner: Scanner, rng: np.random.Generator) -> SimulatedScan:
 
 
 KINDS: dict[str, Callable[[Scanner, np.random.Generator], SimulatedScan]] = {
-    "orbit": orbit, "oneview": oneview, "lines": lines, "photo": photo, "flipped": flipped,
+    "orbit": orbit, "oneview": oneview, "depth": depth, "lines": lines, "photo": photo, "flipped": flipped,
 }  # fmt: skip
 
 

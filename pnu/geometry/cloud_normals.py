@@ -7,6 +7,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from pnu.geometry.cloud_statistics import CONTRADICTING, contradicting
+from pnu.geometry.depth_steps import depth_steps, smoothed_within_steps, steps_words
 from pnu.geometry.flipped_parts import flipped_share
 from pnu.geometry.normal_estimation import complete_normals, orient_normals, refit_normals
 from pnu.geometry.normal_sides import hidden, largest_piece, repaired_signs, seen_signs
@@ -120,21 +121,34 @@ def settled_through_noise(
     scans: np.ndarray | None = None,
     **options: Any,
 ) -> Settled:
-    """As `settled_normals`; but where points (n, 3) without normals lie in a layer thicker than their spacing, each has
-    the normal of the nearest of the means that stand for them (`pnu.geometry.thick_layers`)."""
-    bare = normals is None or options.get("choice") == "estimate"
-    noise = layer_noise(points) if bare else None
-    if noise is None:
+    """As `settled_normals`; but of points (n, 3) without normals those whose depths come in wide steps have the normals
+    of the surface through these (`pnu.geometry.depth_steps`), and each of a layer thicker than their spacing that of
+    the nearest of the means that stand for them (`pnu.geometry.thick_layers`)."""
+    if normals is not None and options.get("choice") != "estimate":
         return settled_normals(points, normals, asked=asked, found=found, scans=scans, **options)
+    camera = camera_place(points)
+    steps = depth_steps(points, camera)
+    if steps is not None:
+        points = smoothed_within_steps(points, steps)
+        found = found or (None if camera is None else camera_sight(camera))
+    noise = layer_noise(points)
+    if noise is None:
+        settled = settled_normals(points, None, asked=asked, found=found, scans=scans, **options)
+        return settled if steps is None else _by_other_points(settled, f"through {steps_words(steps)}")
     means = layer_means(points, noise)
     found = found or sight_by_places(points)  # which means do not tell any more
     asked, found = (_of_rows(sight, means.rows) for sight in (asked, found))
     some = None if scans is None else scans[means.rows]
     settled = settled_normals(means.points, None, asked=asked, found=found, scans=some, **options)
     nearest = PointTree(means.points).nearest(points, 1)[1][:, 0]
+    settled = settled._replace(normals=settled.normals[nearest])
+    return _by_other_points(settled, f"by {len(means.rows)} means, as noise is wider than the spacing")
+
+
+def _by_other_points(settled: Settled, how: str) -> Settled:
+    """Normals that were estimated by points that stand for those given, and that said."""
     _, separator, side = settled.words.partition("; side: ")
-    words = f"{len(points)} estimated, by {len(means.rows)} means, as noise is wider than the spacing{separator}{side}"
-    return settled._replace(normals=settled.normals[nearest], words=words)
+    return settled._replace(words=f"{len(settled.normals)} estimated, {how}{separator}{side}")
 
 
 def _of_rows(sight: Sight | None, rows: np.ndarray) -> Sight | None:

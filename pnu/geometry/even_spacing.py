@@ -45,7 +45,7 @@ def tangent_discs(
     toward = cloud[idx[:, 1]] - points
     along = toward - (toward * normals).sum(-1, keepdims=True) * normals
     short = np.linalg.norm(along, axis=-1, keepdims=True) <= 1e-6 * radius
-    along = _unit(np.where(short, _perpendicular(normals), along))
+    along = _unit(np.where(short, perpendicular(normals), along))
     across = np.cross(normals, along)
     seed = np.arange(count, dtype=kind)
     discs = np.empty((len(points), count, 3), kind) if out is None else out
@@ -127,7 +127,7 @@ def _unit(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
     return found
 
 
-def _perpendicular(normals: NDArray[np.floating]) -> NDArray[np.floating]:
+def perpendicular(normals: NDArray[np.floating]) -> NDArray[np.floating]:
     """A unit vector across each unit normal (n, 3), the first of `pnu.geometry.local_frames.tangent_basis`."""
     aside = np.zeros_like(normals)
     np.put_along_axis(aside, np.abs(normals).argmin(1)[:, None], 1, 1)

@@ -53,8 +53,9 @@ class Examples(NamedTuple):
 
 def clouds(mesh: Mesh, scanner: Scanner, rng: np.random.Generator) -> Iterator[np.ndarray]:
     """Clouds (n, 3) of a mesh, with strays and without."""
-    for scan in KINDS.values():
-        yield scan(scanner, rng).points
+    for kind, scan in KINDS.items():
+        if kind != "depth":  # whose steps are smoothed before strays are looked for
+            yield scan(scanner, rng).points
     for _ in range(3):
         yield any_scan(scanner, rng).points
     plain = Crops({"": mesh}, 1, normals="estimated")

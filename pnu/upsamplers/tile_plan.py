@@ -32,6 +32,7 @@ from pnu.geometry.cloud_normals import (
     sight_from_within,
 )
 from pnu.geometry.cloud_statistics import FAINT
+from pnu.geometry.depth_steps import depth_steps, smoothed_within_steps
 from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.normal_estimation import complete_normals
 from pnu.geometry.point_tree import PointTree
@@ -97,6 +98,8 @@ class Facts:
     """Distance to which points in lines are thinned out; None: there are no lines."""
     layered: float | None = None
     """Noise of points in a layer thicker than their spacing, which are averaged; None: there is no such layer."""
+    steps: float | None = None
+    """Width of steps of depth, within which points are smoothed; None: there are none wider than the spacing."""
     smooth: bool = False
     """Whether points are noisy beside their spacing, and smoothed first."""
     keep: bool = False
@@ -398,6 +401,8 @@ def _decided(folder: Path, keys: Keys, facts: Facts, progress: Progress) -> None
     elif most("layered") and keys.noise == "auto" and keys.keep is not True:
         facts.layered = middle("layered")
         facts.given = facts.trusted and not most("turned")
+    if most("steps") and keys.noise == "auto" and keys.keep is not True:
+        facts.steps = middle("steps")
     facts.apart = max(look["apart" if facts.lined or facts.layered else "apart_raw"] for look in found)
     facts.smooth = most("noisy")
     facts.heights = most("heights")
@@ -423,8 +428,12 @@ def _block(rows: NDArray[Any]) -> NDArray[Any]:
 
 def _look(points: np.ndarray, normals: np.ndarray | None, keys: Keys, size: int) -> dict[str, Any]:
     """What a block of the cloud is like."""
+    steps = depth_steps(points)
+    if steps is not None:
+        points = smoothed_within_steps(points, steps)
     stray = stray_points(points) if keys.outliers == "auto" else np.zeros(len(points), bool)
     look: dict[str, Any] = {"points": size, "stray": float(stray.mean()), "heights": is_height_map(points)}
+    look["steps"] = None if steps is None else float(np.median(steps.step))
     points, normals = points[~stray], None if normals is None else normals[~stray]
     look["apart_raw"] = float(np.quantile(local_spacing(points), 0.9))
     look["turned"] = "" if normals is None else contradiction(points, normals)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pnu.cleaning import stray_points
 from pnu.geometry.anisotropy import averaged, mean_normals
 from pnu.geometry.cloud_normals import normals_on_sides
+from pnu.geometry.depth_steps import depth_steps, smoothed_within_steps
 from pnu.geometry.even_spacing import RANK, tangent_discs
 from pnu.geometry.farthest_sampling import thinned_to
 from pnu.geometry.normal_estimation import complete_normals
@@ -100,6 +101,8 @@ def prepared(plan: Plan, number: int) -> None:
     rows = plan.region(number)
     own = len(np.load(plan.path("points", number), mmap_mode="r"))
     spread = float(point_areas(rows["point"])[:own].sum()) if keys.spacing is not None else 0.0
+    if facts.steps is not None and (steps := depth_steps(rows["point"])) is not None:
+        rows["point"] = smoothed_within_steps(rows["point"], steps)
     stray = stray_points(rows["point"]) if keys.outliers == "auto" else np.zeros(len(rows), bool)
     strays = int(stray[:own].sum())
     rows = rows[~stray]

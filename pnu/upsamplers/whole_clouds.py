@@ -157,8 +157,8 @@ def upsample(
             spread and show no noise.
         outliers: "auto": stray points are taken out first, and not counted less for it: n stays; "keep": none is.
         lines: "auto": scan lines, dense along and sparse across, are thinned out first; "keep": they stay.
-        noise: "auto": where points lie in a layer thicker than their spacing, means take their place; "keep": they
-            stay, and are only smoothed.
+        noise: "auto": where points lie in a layer thicker than their spacing, means take their place, and where depths
+            come in wider steps than that, points move within half a step; "keep": they stay, and are only smoothed.
         signs: "auto": where given normals contradict each other, their axes are kept and their sides chosen anew; where
             they are poor, as planes fitted to neighbors are, their sides are kept and their axes found anew; "keep":
             they are taken as they are.

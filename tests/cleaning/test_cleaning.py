@@ -200,9 +200,25 @@ def test_scans_have_the_truth_beside_them(kind: str) -> None:
     assert len(scan.points) == len(scan.clean) == len(scan.sensor) == len(scan.stray) > 500
     off = np.linalg.norm(scan.points - scan.clean[:, :3], axis=1)[~scan.stray]
     assert 0.0005 < np.median(off) < 0.01
-    if kind in ("orbit", "oneview", "lines"):
+    if kind in ("orbit", "oneview", "depth", "lines"):
         toward = scan.sensor - scan.clean[:, :3]
         assert ((toward * scan.clean[:, 3:]).sum(1) > 0).all()  # a sensor sees the side that faces it
+
+
+@pytest.mark.parametrize("name", ["teddy", "bracket"])
+def test_steps_of_depth_become_the_surface_that_runs_through_them(name: str) -> None:
+    scan = KINDS["depth"](Scanner(shapes.make(name)), np.random.default_rng(3))
+    cleaned = clean_cloud(Cloud(scan.points, None, {}), outliers="keep")
+    assert "each point moved by half a step at most" in cleaned.cloud.notes[0]
+    off, raw = (
+        np.abs(((points - scan.clean[:, :3]) * scan.clean[:, 3:]).sum(1)).mean()
+        for points in (cleaned.cloud.points, scan.points)
+    )
+    assert off < 0.6 * raw
+    kept = clean_cloud(Cloud(scan.points, None, {}), outliers="keep", noise="keep").cloud
+    np.testing.assert_array_equal(kept.points, scan.points)
+    normals = pnu.normals(scan.points)
+    assert np.degrees(np.arccos((normals * scan.clean[:, 3:]).sum(1).clip(-1, 1))).mean() < 10
 
 
 @pytest.mark.slow

@@ -128,7 +128,7 @@ def test_sensors_that_cannot_have_seen_the_points_are_not_believed() -> None:
 def test_none_is_found_in_what_was_scanned_from_outside(name: str, kind: str) -> None:
     points = KINDS[kind](Scanner(shapes.make(name)), np.random.default_rng(1)).points
     place = scanner_within(points, complete_normals(points, None, 16))
-    if kind != "oneview":  # whose camera is outside of the points
+    if kind not in ("oneview", "depth"):  # whose camera is outside of the points
         assert place is None
 
 

@@ -208,6 +208,19 @@ def test_a_layer_of_noise_is_averaged(tmp_path: Path) -> None:
     assert (np.abs(dense[:, 5]) > 0.9).mean() > 0.98
 
 
+@pytest.mark.slow
+def test_steps_of_depth_are_smoothed(tmp_path: Path) -> None:
+    x, y = (grid.ravel() for grid in np.meshgrid(np.arange(0, 20, 0.15), np.arange(0, 20, 0.15)))
+    true = 0.2 * x + np.sin(y / 4)
+    points = np.column_stack([x, y, np.round(true / 0.4) * 0.4])
+    plan = plan_of(tmp_path, points, 10000, ratio=1)
+    assert len(plan.tiles) == 2
+    assert plan.facts.steps == pytest.approx(0.4)
+    dense = make(plan)
+    off = np.abs(dense[:, 2] - 0.2 * dense[:, 0] - np.sin(dense[:, 1] / 4))
+    assert off.mean() < 0.4 * np.abs(points[:, 2] - true).mean()
+
+
 def test_density_follows_as_without_tiles(tmp_path: Path) -> None:
     points = sheet(900)
     points = points[(points[:, 0] < 15) | (np.arange(900) % 6 == 0)]
