@@ -47,6 +47,7 @@ __all__ = [
     "is_noisy",
     "stray_points",
     "with_axes_anew",
+    "without_depth_steps",
     "without_normals",
 ]
 
@@ -97,13 +98,9 @@ def clean_cloud(
         if value not in TREATMENTS:
             raise ValueError(f"{name}={value}: expected auto or keep")
     given, camera = cloud, camera_place(cloud.points) if cloud.normals is None else None
+    if noise == "auto":
+        cloud = without_depth_steps(cloud, camera, unless="noise=keep")
     notes = list(cloud.notes)
-    steps = depth_steps(cloud.points, camera) if noise == "auto" else None
-    if steps is not None:
-        notes.append(
-            f"{steps_words(steps)}: each point moved by half a step at most, onto the surface through them (noise=keep)"
-        )
-        cloud = cloud._replace(points=smoothed_within_steps(cloud.points, steps))
     stray = np.flatnonzero(stray_points(cloud.points, camera)) if outliers == "auto" else np.empty(0, np.int64)
     if len(stray):
         how = "they lie off the surface" if camera is None else f"torn off at edges, as a {camera_words(camera)} saw"
@@ -123,6 +120,16 @@ def clean_cloud(
         return with_axes_anew(found, why, lines=lines, noise=noise)
     level = layer_noise(cloud.points) if noise == "auto" else None
     return found if level is None else found._replace(cloud=_layer_averaged(found.cloud, level))
+
+
+def without_depth_steps(cloud: Cloud, camera: NDArray[np.float64] | None, *, unless: str) -> Cloud:
+    """A cloud whose depths come in no wide steps, as seen from the place (3,) of a camera or from elsewhere, and a note
+    on that, with what leaves them."""
+    steps = depth_steps(cloud.points, camera)
+    if steps is None:
+        return cloud
+    note = f"{steps_words(steps)}: each point moved by half a step at most, onto the surface through them ({unless})"
+    return cloud._replace(points=smoothed_within_steps(cloud.points, steps), notes=(*cloud.notes, note))
 
 
 def without_normals(cloud: Cloud, why: str) -> Cloud | None:

@@ -51,13 +51,17 @@ def reconstruct(cfg: Any) -> None:
     import numpy as np
 
     from pnu import io, reconstruction
+    from pnu.cleaning import without_depth_steps
     from pnu.geometry.cloud_statistics import describe_cloud
     from pnu.geometry.mesh_topology import open_edges, vertex_normals
+    from pnu.geometry.single_view import camera_place
 
     started = time.perf_counter()
     say: Callable[[str], None] = (lambda text: None) if cfg.quiet else print
     _check_options(cfg)
     cloud = io.read_cloud(cfg.input, normals=cfg.normals != "estimate", columns=cfg.columns)
+    if cfg.normals != "keep":
+        cloud = without_depth_steps(cloud, camera_place(cloud.points), unless="normals=keep")
     origin = "with normals" if cloud.normals is not None else "normals estimated and oriented"
     say(f"input:  {cfg.input}, {len(cloud.points)} points, {origin}")
     for note in cloud.notes:

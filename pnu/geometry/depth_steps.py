@@ -24,9 +24,9 @@ BESIDE = 3  # gaps either side, of which the least is the step: the others have 
 WIDE = 1.05  # spacings of a step from which on; even grids have 1
 PLACES, AROUND = 1000, 24  # of the cloud, and neighbors, of which those of the same step
 BROAD, MOSTLY = 0.02, 0.3  # spread in two directions, squared width over length, at this share of the places
-FLAT, PLANE = 1e-8, 12  # squared thickness over width of so many points that lie in a plane
-ALIKE = 1e-6  # one less the cosine between such planes; a tenth of the places has to have them
-TENTH = 0.1
+LOOKED, PLANE = 400, 12  # places, and points of each that lie in a plane,
+FLAT, ALIKE = 1e-8, 1e-6  # as squared thickness over width says; one less the cosine between such planes,
+TENTH = 0.1  # which that share of the places has to have
 CELL, MID = 0.5, 0.25  # steps, size of the cells whose means are smoothed; of a cell, so that no step is its border
 NEIGHBORS, ROUNDS = 64, 10
 NARROW = 4.5  # of the weights exp(-4.5 r^2), r = 1 at the farthest neighbor
@@ -141,7 +141,7 @@ def _are_terraces(points: Floats, level: NDArray[np.int64]) -> bool:
 
 def _terrace_normal(points: Floats) -> Floats | None:
     """The direction (3,) that most planes through few neighbors are exactly normal to, if a tenth of them is."""
-    places = points[:: -(-len(points) // PLACES)]
+    places = points[:: -(-len(points) // LOOKED)]
     near = points[PointTree(points).nearest(places, PLANE, threads=thread_count())[1]]
     near = near - near.mean(1, keepdims=True)
     size, axes = np.linalg.eigh(near.swapaxes(1, 2) @ near)

@@ -14,6 +14,7 @@ from pnu.geometry.mesh_sampling import sample_area, signed_volume
 from pnu.geometry.normal_estimation import estimate_normals
 from pnu.io import Mesh, read_cloud, read_json, read_mesh, write_cloud, write_mesh
 from tests import refusals
+from tests.geometry.test_depth_steps import off_sphere, seen_sphere, stepped
 from tests.reconstruction.test_surfaces import icosphere, sphere_points
 
 
@@ -228,3 +229,15 @@ def test_columns_of_text(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert said.endswith("""output=picture.png 'columns="nx,ny,nz,_,x,y,z"'\n""")  # the picture reads that file too
     line = refused(capsys, reconstruct, **given | {"output": tmp_path / "n.ply"}, columns="nx,ny,nz,x,y,z")
     assert "columns=nx,ny,nz,x,y,z are 6 names, line 1 has 7 columns" in line
+
+
+def test_steps_of_depth_are_no_terraces_of_the_surface(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    true = seen_sphere(80)[0]
+    points = stepped(true, 0.06)
+    write_cloud(tmp_path / "scan.ply", points, [0, 0, 3] - true)
+    off = {}
+    for normals in ("keep", "auto"):
+        run(reconstruct, input=tmp_path / "scan.ply", output=tmp_path / f"{normals}.ply", normals=normals, depth=6)
+        assert ("steps of depth of about 0.06" in capsys.readouterr().out) == (normals == "auto")
+        off[normals] = off_sphere(read_mesh(tmp_path / f"{normals}.ply").vertices)
+    assert off["auto"] < 0.7 * off["keep"]
