@@ -16,23 +16,23 @@ from pnu.geometry.spacing import spacing
 from pnu.runtime.threads import thread_count
 
 Floats = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 FEWEST = 1000  # points that tell
 SAME = 1e-3  # spacings by which depths of one step differ at most
 PER_STEP = 20  # points, as a mean over all steps
 BESIDE = 3  # gaps either side, of which the least is the step: the others have none of the surface between
 WIDE = 1.05  # spacings of a step from which on; even grids have 1
-PLACES, AROUND = 1000, 24  # of the cloud, and neighbors, of which those of the same step
+PLACES, AROUND = 500, 24  # of the cloud, and neighbors, of which those of the same step
 BROAD, MOSTLY = 0.02, 0.3  # spread in two directions, squared width over length, at this share of the places
-LOOKED, PLANE = 400, 12  # places, and points of each that lie in a plane,
-FLAT, ALIKE = 1e-8, 1e-6  # as squared thickness over width says; one less the cosine between such planes,
-TENTH = 0.1  # which that share of the places has to have
+PLANE, FLAT = 12, 1e-8  # points of a place that lie in a plane, as squared thickness over width says;
+ALIKE, TENTH = 1e-6, 0.1  # one less the cosine between such planes, and the share of the places that has to have them
 CELL, MID = 0.5, 0.25  # steps, size of the cells whose means are smoothed; of a cell, so that no step is its border
 NEIGHBORS, ROUNDS = 64, 10
 NARROW = 4.5  # of the weights exp(-4.5 r^2), r = 1 at the farthest neighbor
 RIDGE = 1e-5  # on curvatures, for neighbors that do not tell them
 ASLANT = 0.3  # cosine of a ray with depth from which on points move along it
-BLOCK = 4096
+ROWS, BLOCK = 2**16, 2**12  # points at once: bounds the memory
 
 
 class DepthSteps(NamedTuple):
@@ -55,7 +55,8 @@ def depth_steps(points: Floats, camera: Floats | None = None) -> DepthSteps | No
     if len(points) < FEWEST:
         return None
     apart = spacing(points)
-    axes = [*np.eye(3), _terrace_normal(points)]
+    places = np.lexsort(points.T)[:: -(-len(points) // PLACES)]  # the same ones in whatever order points come
+    axes = [*np.eye(3), _terrace_normal(points, places)]
     depths = [(points @ axis, np.broadcast_to(axis, points.shape)) for axis in axes if axis is not None]
     depths += [_rays(points, place) for place in (np.zeros(3), camera) if place is not None]
     for depth, direction in depths:
@@ -64,7 +65,7 @@ def depth_steps(points: Floats, camera: Floats | None = None) -> DepthSteps | No
             continue
         level, step = found
         wide = float(np.median(step)) / apart
-        if wide > WIDE and _are_terraces(points, level):
+        if wide > WIDE and _are_terraces(points, level, places):
             return DepthSteps(depth, step, direction, _ways(points, direction, camera), wide)
     return None
 
@@ -86,13 +87,16 @@ def smoothed_within_steps(points: Floats, steps: DepthSteps) -> Floats:
     )
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     smooth, within = depth, (depth - half, depth + half)  # the mean of depths lies within the mean of their bounds
-    near, weight = _quadratic_fits(place, place, direction)
+    near, weight = _quadratic_fits(PointTree(place), place, direction)
     for _ in range(ROUNDS):
         smooth = np.clip((weight * smooth[near]).sum(1), *within)
-    near, weight = _quadratic_fits(place + (smooth - depth)[:, None] * way, points, steps.direction)
-    fitted = np.clip((weight * smooth[near]).sum(1), steps.depth - steps.step / 2, steps.depth + steps.step / 2)
-    moved = np.empty_like(points)
-    moved[order] = points + (fitted - steps.depth)[:, None] * steps.way
+    tree, moved = PointTree(place + (smooth - depth)[:, None] * way), np.empty_like(points)
+    for start in range(0, len(points), ROWS):
+        part = slice(start, start + ROWS)
+        near, weight = _quadratic_fits(tree, points[part], steps.direction[part])
+        half = steps.step[part] / 2
+        change = np.clip((weight * smooth[near]).sum(1) - steps.depth[part], -half, half)
+        moved[order[part]] = points[part] + change[:, None] * steps.way[part]
     return moved
 
 
@@ -116,7 +120,7 @@ def _ways(points: Floats, direction: Floats, camera: Floats | None) -> Floats:
     return np.where(np.abs(along) > ASLANT, ray / np.where(along == 0, 1, along), direction)
 
 
-def _levels(depth: Floats, same: float) -> tuple[NDArray[np.int64], Floats] | None:
+def _levels(depth: Floats, same: float) -> tuple[Index, Floats] | None:
     """Which of the levels each depth (n,) is of, from below, and how wide the step is there; None: there are none."""
     order = np.argsort(depth, kind="stable")
     gap = np.diff(depth[order])
@@ -129,20 +133,19 @@ def _levels(depth: Floats, same: float) -> tuple[NDArray[np.int64], Floats] | No
     return level, np.lib.stride_tricks.sliding_window_view(beside, 2 * BESIDE).min(1)[level]
 
 
-def _are_terraces(points: Floats, level: NDArray[np.int64]) -> bool:
-    """Whether points (n, 3) of one level spread over areas, not along curves."""
-    rows = np.arange(0, len(points), -(-len(points) // PLACES))
-    idx = PointTree(points).nearest(points[rows], AROUND, threads=thread_count())[1]
-    same = (level[idx] == level[rows, None])[..., None].astype(np.float64)
+def _are_terraces(points: Floats, level: Index, places: Index) -> bool:
+    """Whether points (n, 3) of one level spread over areas, not along curves, at some of them."""
+    idx = PointTree(points).nearest(points[places], AROUND, threads=thread_count())[1]
+    same = (level[idx] == level[places, None])[..., None].astype(np.float64)
     near = points[idx] - (same * points[idx]).sum(1, keepdims=True) / same.sum(1, keepdims=True)
     size = np.linalg.eigvalsh(near.swapaxes(1, 2) @ (same * near))
     return float((size[:, 1] > BROAD * size[:, 2]).mean()) > MOSTLY
 
 
-def _terrace_normal(points: Floats) -> Floats | None:
-    """The direction (3,) that most planes through few neighbors are exactly normal to, if a tenth of them is."""
-    places = points[:: -(-len(points) // LOOKED)]
-    near = points[PointTree(points).nearest(places, PLANE, threads=thread_count())[1]]
+def _terrace_normal(points: Floats, places: Index) -> Floats | None:
+    """The direction (3,) to which most planes through few neighbors of some of the points (n, 3) are exactly normal, if
+    a tenth of them is."""
+    near = points[PointTree(points).nearest(points[places], PLANE, threads=thread_count())[1]]
     near = near - near.mean(1, keepdims=True)
     size, axes = np.linalg.eigh(near.swapaxes(1, 2) @ near)
     normals = axes[size[:, 0] <= FLAT * size[:, 1], :, 0]
@@ -157,17 +160,17 @@ def _terrace_normal(points: Floats) -> Floats | None:
     return normal
 
 
-def _quadratic_fits(source: Floats, target: Floats, direction: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """For each target (m, 3) its neighbors among the sources (n, 3), (m, k), and weights (m, k): with values at these
+def _quadratic_fits(sources: PointTree, target: Floats, direction: Floats) -> tuple[Index, Floats]:
+    """For each target (m, 3) its neighbors among the sources, (m, k), and weights (m, k): with values at these
     their sum is that of a quadratic fit, over the plane across the direction (m, 3), at the target."""
-    distance, near = PointTree(source).nearest(target, min(NEIGHBORS, len(source)), threads=thread_count())
+    distance, near = sources.nearest(target, min(NEIGHBORS, len(sources.points)), threads=thread_count())
     radius = np.maximum(distance[:, -1:], 1e-300)
     aside = perpendicular(direction)
     across = np.stack([aside, np.cross(direction, aside)], -1)
     weights: Floats = np.exp(-NARROW * (distance / radius) ** 2)
     for start in range(0, len(target), BLOCK):
         part = slice(start, start + BLOCK)
-        offset = (source[near[part]] - target[part, None]) @ across[part] / radius[part, None]
+        offset = (sources.points[near[part]] - target[part, None]) @ across[part] / radius[part, None]
         u, v = np.moveaxis(offset, -1, 0)
         terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], -1)
         weighted = weights[part, :, None] * terms

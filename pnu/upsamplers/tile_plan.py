@@ -401,7 +401,7 @@ def _decided(folder: Path, keys: Keys, facts: Facts, progress: Progress) -> None
     elif most("layered") and keys.noise == "auto" and keys.keep is not True:
         facts.layered = middle("layered")
         facts.given = facts.trusted and not most("turned")
-    if most("steps") and keys.noise == "auto" and keys.keep is not True:
+    if most("steps"):
         facts.steps = middle("steps")
     facts.apart = max(look["apart" if facts.lined or facts.layered else "apart_raw"] for look in found)
     facts.smooth = most("noisy")
@@ -428,7 +428,7 @@ def _block(rows: NDArray[Any]) -> NDArray[Any]:
 
 def _look(points: np.ndarray, normals: np.ndarray | None, keys: Keys, size: int) -> dict[str, Any]:
     """What a block of the cloud is like."""
-    steps = depth_steps(points)
+    steps = depth_steps(points) if keys.noise == "auto" and keys.keep is not True else None
     if steps is not None:
         points = smoothed_within_steps(points, steps)
     stray = stray_points(points) if keys.outliers == "auto" else np.zeros(len(points), bool)
