@@ -205,7 +205,7 @@ def test_scans_have_the_truth_beside_them(kind: str) -> None:
         assert ((toward * scan.clean[:, 3:]).sum(1) > 0).all()  # a sensor sees the side that faces it
 
 
-@pytest.mark.parametrize("name", ["teddy", "bracket"])
+@pytest.mark.parametrize("name", ["teddy", pytest.param("bracket", marks=pytest.mark.slow)])
 def test_steps_of_depth_become_the_surface_that_runs_through_them(name: str) -> None:
     scan = KINDS["depth"](Scanner(shapes.make(name)), np.random.default_rng(3))
     cleaned = clean_cloud(Cloud(scan.points, None, {}), outliers="keep")

@@ -231,6 +231,7 @@ def test_columns_of_text(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert "columns=nx,ny,nz,x,y,z are 6 names, line 1 has 7 columns" in line
 
 
+@pytest.mark.slow
 def test_steps_of_depth_are_no_terraces_of_the_surface(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     true = seen_sphere(80)[0]
     points = stepped(true, 0.06)
