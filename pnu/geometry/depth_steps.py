@@ -25,6 +25,8 @@ BESIDE = 3  # gaps either side, of which the least is the step: the others have 
 WIDE = 1.05  # spacings of a step from which on; even grids have 1
 PLACES, AROUND = 500, 24  # of the cloud, and neighbors, of which those of the same step
 BROAD, MOSTLY = 0.02, 0.3  # spread in two directions, squared width over length, at this share of the places
+BESIDES, NEXT = 64, (0.2, 2.5)  # neighbors, and spacings across to the nearest of them at another level,
+FIFTH = 0.2  # of the places where that is least
 PLANE, FLAT = 12, 1e-8  # points of a place that lie in a plane, as squared thickness over width says;
 ALIKE, TENTH = 1e-6, 0.1  # one less the cosine between such planes, and the share of the places that has to have them
 CELL, MID = 0.5, 0.25  # steps, size of the cells whose means are smoothed; of a cell, so that no step is its border
@@ -65,7 +67,7 @@ def depth_steps(points: Floats, camera: Floats | None = None) -> DepthSteps | No
             continue
         level, step = found
         wide = float(np.median(step)) / apart
-        if wide > WIDE and _are_terraces(points, level, places):
+        if wide > WIDE and _are_terraces(points, level, direction, places, apart):
             return DepthSteps(depth, step, direction, _ways(points, direction, camera), wide)
     return None
 
@@ -133,13 +135,23 @@ def _levels(depth: Floats, same: float) -> tuple[Index, Floats] | None:
     return level, np.lib.stride_tricks.sliding_window_view(beside, 2 * BESIDE).min(1)[level]
 
 
-def _are_terraces(points: Floats, level: Index, places: Index) -> bool:
-    """Whether points (n, 3) of one level spread over areas, not along curves, at some of them."""
-    idx = PointTree(points).nearest(points[places], AROUND, threads=thread_count())[1]
-    same = (level[idx] == level[places, None])[..., None].astype(np.float64)
-    near = points[idx] - (same * points[idx]).sum(1, keepdims=True) / same.sum(1, keepdims=True)
+def _are_terraces(points: Floats, level: Index, direction: Floats, places: Index, apart: float) -> bool:
+    """Whether points (n, 3) of one level spread over areas, not along curves, as some of them show, and those of the
+    next level lie beside them: neither above each other nor far apart, as the corners of parts with walls do."""
+    idx = PointTree(points).nearest(points[places], min(BESIDES, len(points)), threads=thread_count())[1]
+    like = level[idx] == level[places, None]
+    same = like[:, :AROUND, None].astype(np.float64)
+    near = points[idx[:, :AROUND]]
+    near = near - (same * near).sum(1, keepdims=True) / same.sum(1, keepdims=True)
     size = np.linalg.eigvalsh(near.swapaxes(1, 2) @ (same * near))
-    return float((size[:, 1] > BROAD * size[:, 2]).mean()) > MOSTLY
+    if (size[:, 1] > BROAD * size[:, 2]).mean() <= MOSTLY:
+        return False
+    way, along = points[idx] - points[places, None], direction[places, None]
+    across = np.linalg.norm(way - (way * along).sum(-1, keepdims=True) * along, axis=-1)
+    beside = np.where(like, np.inf, across).min(1)
+    beside = beside[np.isfinite(beside)]
+    low, high = NEXT
+    return len(beside) < TENTH * len(places) or low * apart < float(np.quantile(beside, FIFTH)) < high * apart
 
 
 def _terrace_normal(points: Floats, places: Index) -> Floats | None:

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from pnu.data import shapes
 from pnu.geometry.depth_steps import WIDE, depth_steps, smoothed_within_steps
 from pnu.geometry.spacing import spacing
 
@@ -119,6 +120,10 @@ NO_STEPS = {
     "rings": rings(),
     "fine steps": stepped(seen_sphere()[0], 0.9 * WIDE * spacing(seen_sphere()[0])),
     "few": stepped(seen_sphere(30)[0], 0.1),
+    **{
+        name: np.unique(shapes.make(name).vertices, axis=0)
+        for name in ("bolt", "enclosure", "flange", "gear", "pulley")
+    },
 }
 
 
