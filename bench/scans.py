@@ -4,7 +4,7 @@ Each mesh of the folder, brought to the unit sphere, is scanned in every way of 
 cloud of four times as many points of the scan. "pnu" is `pnu.upsample` as it is called by default; "pnu, as it is" the
 same without cleaning; "open3d" what users of Open3D do: statistical outlier removal, normals, consistent tangent
 planes, Poisson, the least dense 3 % trimmed, Poisson-disk samples. The clouds go to OUTPUT/METHOD/SHAPE_KIND.ply,
-the scans to OUTPUT/scans.
+the scans to OUTPUT/scans, the places on the surface that they mean to OUTPUT/true.
 """
 
 import argparse
@@ -61,8 +61,10 @@ def main() -> None:
         for kind in arguments.kinds:
             scan = KINDS[kind](scanner, generator(arguments.seed, name, kind))
             seen = seen_samples(truth, scan, kind)
-            (arguments.output / "scans").mkdir(parents=True, exist_ok=True)
-            write_cloud(arguments.output / "scans" / f"{name}_{kind}.ply", scan.points, scan.normals)
+            true = scan.clean[np.isfinite(scan.clean[:, 0])]
+            for part, points, normals in (("scans", scan.points, scan.normals), ("true", true[:, :3], true[:, 3:])):
+                (arguments.output / part).mkdir(parents=True, exist_ok=True)
+                write_cloud(arguments.output / part / f"{name}_{kind}.ply", points, normals)
             for method in arguments.methods:
                 started = time.perf_counter()
                 dense = METHODS[method](scan)

@@ -216,6 +216,8 @@ def test_steps_of_depth_are_smoothed(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, points, 10000, ratio=1)
     assert len(plan.tiles) == 2
     assert plan.facts.steps == pytest.approx(0.4)
+    (tmp_path / "keep").mkdir()
+    assert plan_of(tmp_path / "keep", points, 10000, ratio=1, noise="keep").facts.steps is None
     dense = make(plan)
     off = np.abs(dense[:, 2] - 0.2 * dense[:, 0] - np.sin(dense[:, 1] / 4))
     assert off.mean() < 0.4 * np.abs(points[:, 2] - true).mean()
