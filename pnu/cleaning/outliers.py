@@ -1,9 +1,10 @@
 """Stray points: those that measure nothing, found by small trained networks and taken out.
 
-One network looks at how a point lies among its neighbors in space. What it leaves doubtful a second one holds against
-the surface that all others sample, near and far: where a cloud thins out its last points are no strays. Where one
-camera saw all points, another looks at how the depth of each fits to that of the pixels around it, which tells points
-torn off at edges from surfaces seen at a slant.
+Where points are strewn all around, so many that they have each other for neighbors, these go first. One network then
+looks at how a point lies among its neighbors in space. What it leaves doubtful a second one holds against the surface
+that all others sample, near and far: where a cloud thins out its last points are no strays. Where one camera saw all
+points, another looks at how the depth of each fits to that of the pixels around it, which tells points torn off at
+edges from surfaces seen at a slant.
 """
 
 from functools import cache
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pnu.cleaning.clutter import clutter_points
 from pnu.geometry.connected_parts import connected_parts
 from pnu.geometry.doubt_features import doubt_features
 from pnu.geometry.outlier_features import outlier_features
@@ -76,7 +78,7 @@ def stray_points(points: NDArray[np.float64], camera: NDArray[np.float64] | None
 
 def _in_space(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which points (n, 3) stay, (n,)."""
-    stays, enough = np.ones(len(points), bool), SURE
+    stays, enough = ~clutter_points(points), SURE
     for _ in range(ROUNDS):
         rows = np.flatnonzero(stays)
         if len(rows) < FEWEST:

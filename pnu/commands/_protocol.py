@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 KINDS = (
     "of input: uniform, random, nonuniform, sparse (a quarter of the points), noise_0.5, noise_1, noise_2; "
-    "simulated scans: orbit, oneview, depth, lines, photo, flipped; null: the protocol's"
+    "simulated scans: orbit, oneview, depth, lines, photo, flipped, clutter; null: the protocol's"
 )
 
 MERGE = (

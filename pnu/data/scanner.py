@@ -205,8 +205,14 @@ def flipped(scanner: Scanner, rng: np.random.Generator) -> SimulatedScan:
     return scanner.turned_over(5000, 0.004, 0.25, rng)
 
 
+def clutter(scanner: Scanner, rng: np.random.Generator) -> SimulatedScan:
+    """5000 points of little noise, and a quarter as many strewn all around them."""
+    return scanner.photogrammetry(Photogrammetry(5000, unevenness=1, noise=0.002, near=0, far=0.25, holes=0), rng)
+
+
 KINDS: dict[str, Callable[[Scanner, np.random.Generator], SimulatedScan]] = {
     "orbit": orbit, "oneview": oneview, "depth": depth, "lines": lines, "photo": photo, "flipped": flipped,
+    "clutter": clutter,
 }  # fmt: skip
 
 

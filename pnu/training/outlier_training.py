@@ -54,7 +54,7 @@ class Examples(NamedTuple):
 def clouds(mesh: Mesh, scanner: Scanner, rng: np.random.Generator) -> Iterator[np.ndarray]:
     """Clouds (n, 3) of a mesh, with strays and without."""
     for kind, scan in KINDS.items():
-        if kind != "depth":  # whose steps are smoothed before strays are looked for
+        if kind not in ("depth", "clutter"):  # steps are smoothed, and clutter taken out, before strays are looked for
             yield scan(scanner, rng).points
     for _ in range(3):
         yield any_scan(scanner, rng).points
