@@ -17,7 +17,7 @@ from pnu.geometry.cloud_normals import (
     settled_normals,
 )
 from pnu.geometry.depth_steps import depth_steps, smoothed_within_steps, steps_words
-from pnu.geometry.noise_level import noise_level
+from pnu.geometry.noise_level import is_louder_in_places, noise_level
 from pnu.geometry.single_view import camera_place
 from pnu.geometry.spacing import spacing
 from pnu.geometry.thick_layers import LayerMeans, layer_means, layer_noise
@@ -35,6 +35,7 @@ Character = Literal["clean", "scanned", "noisy"]
 NOISY = 0.17  # spacings of noise from which on a cloud is noisy; then what looks stray says nothing of scans
 MANY_ENOUGH = 1000  # points that tell noise from what they do not resolve
 MANY_TO_SMOOTH = 4000  # points of which the 64 neighbors of the weights for noise are a small place
+MOST_PLACES = 100_000  # points whose noise is looked for in places though the whole shows none
 
 __all__ = [
     "TREATMENTS",
@@ -179,10 +180,11 @@ def _with_character(found: Cleaned, lines: Treatment, noise: Treatment) -> Clean
     scanned = found._replace(character="scanned" if share > MANY or found.camera is not None else "clean")
     if rows is not None:
         return scanned._replace(character="scanned")
-    if not is_noisy(cloud.points):  # nor has it thin walls, whose sides normals tell apart
-        return scanned
+    if not is_noisy(cloud.points) and not MANY_TO_SMOOTH <= len(cloud.points) <= MOST_PLACES:
+        return scanned  # without noise, nor with thin walls, whose sides normals tell apart
     estimated = known or settled_normals(cloud.points, None, found=found.sight, scans=scan_numbers(cloud.attributes))
-    if is_noisy(cloud.points, estimated.normals):
+    in_places = scanned.character == "clean"  # weights trained on scans know such noise
+    if is_noisy(cloud.points, estimated.normals, in_places=in_places):
         return found._replace(character=noisy_character(cloud.points), estimated=estimated)
     return scanned._replace(estimated=estimated)
 
@@ -211,9 +213,17 @@ def noisy_character(points: NDArray[np.float64]) -> Character:
     return "noisy" if len(points) >= MANY_TO_SMOOTH else "clean"
 
 
-def is_noisy(points: NDArray[np.float64], normals: NDArray[np.float64] | None = None) -> bool:
-    """Whether points (n, 3), with normals (n, 3) where they are known, show much noise beside their spacing.
+def is_noisy(
+    points: NDArray[np.float64], normals: NDArray[np.float64] | None = None, *, in_places: bool = True
+) -> bool:
+    """Whether points (n, 3), with normals (n, 3) where they are known, show much noise beside their spacing, everywhere
+    or, as normals tell, in places.
 
     Never fewer than 1000: walls that so few do not resolve look like noise, with normals too.
     """
-    return len(points) >= MANY_ENOUGH and noise_level(points, normals) > NOISY * spacing(points)
+    if len(points) < MANY_ENOUGH:
+        return False
+    level = noise_level(points, normals)
+    if level > NOISY * spacing(points):
+        return True
+    return in_places and normals is not None and is_louder_in_places(points, normals, level)

@@ -7,12 +7,25 @@ from numpy.typing import NDArray
 
 from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.point_tree import PointTree
+from pnu.geometry.spacing import spacing
 from pnu.runtime.threads import thread_count
 
 PLACES = 1000
 QUIET = 0.1  # the quietest tenth of the places: elsewhere edges and second sheets look like noise
 # neighbors, and the noise in spacings up to which they tell it apart from the spread of the points themselves
 WINDOWS = ((16, 0.22), (24, 0.4), (48, math.inf))
+
+CLOSEST = 9  # points of which the one most nearly above another is taken,
+NEAR = 0.5  # spacings beside it at most,
+ALIKE = 0.5  # and cosine of the angle between normals at least,
+AROUND = 33  # by each and its neighbors
+MEDIAN = 1.4826 / 2**0.5  # standard deviation over the median distance of two
+SOME = 300  # places that are looked at,
+LOUDEST = 0.9  # quantile of them,
+IN_PLACES = 0.22  # whose noise in spacings counts from there on: unresolved thin walls stay below,
+LOUDER = 3.0  # and times the noise of the whole, as medians around points of even noise vary up to 2.5 times
+ROWS = 2**14  # points at once: bounds the memory
+Floats = NDArray[np.float64]
 
 
 def noise_level(points: NDArray[np.floating], normals: NDArray[np.floating] | None = None) -> float:
@@ -44,6 +57,51 @@ def noise_level(points: NDArray[np.floating], normals: NDArray[np.floating] | No
         if level < enough * float(np.quantile(distance[:, 1:6].mean(1), 0.5, method="lower")):
             break
     return level
+
+
+def local_noise(points: Floats, normals: Floats, rows: NDArray[np.int64] | None = None) -> Floats:
+    """As `noise_level`, but at each of the points (n, 3) with unit normals (n, 3), or at those rows (m,): (n,) or (m,).
+
+    By points that lie nearly above each other, on the same side: how far one is over the other does not depend on the
+    shape there, as it would farther away (to the two normals' mean, points of a sphere are level). Their median around
+    each point. A lower bound where normals follow the noise; 0 where no such points are, as in an evenly spread cloud.
+    """
+    tree, around = PointTree(points), min(AROUND, len(points))
+    rows = np.arange(len(points)) if rows is None else rows
+    named, there = np.unique(tree.nearest(points[rows], around, threads=thread_count())[1], return_inverse=True)
+    height = np.empty(len(named))
+    for first in range(0, len(named), ROWS):
+        some = named[first : first + ROWS]
+        distance, near = tree.nearest(points[some], min(CLOSEST, len(points)), threads=thread_count())
+        height[first : first + ROWS] = _over_another(points, normals, some, near[:, 1:], distance[:, 1:6].mean(1))
+    level: Floats = np.zeros(len(rows))
+    heights = height[there.reshape(-1, around)]
+    told = np.isfinite(heights).any(1)
+    level[told] = MEDIAN * np.nanmedian(heights[told], axis=1)
+    return level
+
+
+def is_louder_in_places(points: Floats, normals: Floats, level: float) -> bool:
+    """Whether at one of ten points (n, 3) with unit normals (n, 3) there is much noise (`local_noise`) beside their
+    spacing, and beside that of the whole, `level`."""
+    some = np.unique(np.linspace(0, len(points) - 1, SOME).round().astype(np.int64))
+    there = local_noise(points, normals, np.lexsort(points.T)[some])
+    return bool(np.quantile(there, LOUDEST) > max(IN_PLACES * spacing(points), LOUDER * level))
+
+
+def _over_another(
+    points: Floats, normals: Floats, rows: NDArray[np.int64], near: NDArray[np.int64], apart: Floats
+) -> Floats:
+    """How far rows (m,) of points (n, 3) lie over that of their neighbors (m, k) that is most nearly below or above,
+    (m,); NaN where none is within a share of how far they lie apart, (m,)."""
+    offset, axis = points[near] - points[rows, None], normals[near] + normals[rows, None]
+    alike = (normals[near] * normals[rows, None]).sum(2) > ALIKE
+    axis /= np.maximum(np.linalg.norm(axis, axis=2, keepdims=True), 1e-9)
+    height = (offset * axis).sum(2)
+    beside = np.where(alike, np.linalg.norm(offset - height[:, :, None] * axis, axis=2), np.inf)
+    nearest = beside.argmin(1)[:, None]
+    height, beside = (np.take_along_axis(values, nearest, 1)[:, 0] for values in (height, beside))
+    return np.where(beside < NEAR * apart, np.abs(height), np.nan)
 
 
 def _residuals(near: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:

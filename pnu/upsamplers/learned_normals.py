@@ -4,11 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnu.cleaning import Character, is_noisy
-from pnu.geometry.cloud_statistics import FAINT
 from pnu.runtime.progress import Progress, silent
 from pnu.upsamplers.context import Context
 from pnu.upsamplers.inference import LoadedWeights, inferring
-from pnu.upsamplers.surface_projection import SurfaceProjection, noise_in_spacings
+from pnu.upsamplers.surface_projection import SurfaceProjection, shows_noise
 
 Floats = NDArray[np.float64]
 
@@ -25,6 +24,5 @@ def learned_normals(points: Floats, normals: Floats, progress: Progress = silent
         upsampler, context = SurfaceProjection(network), Context(progress=progress)
         cloud = np.hstack([points, normals])
         cloud = upsampler.with_refined_normals(cloud, network.passes, context)
-        noisy = noise_in_spacings(cloud) > FAINT
-        found = (upsampler.smoothed if noisy else upsampler.settled)(cloud, context)[:, 3:6]
+        found = (upsampler.smoothed if shows_noise(cloud) else upsampler.settled)(cloud, context)[:, 3:6]
     return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-12))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pnu.geometry.cloud_statistics import FAINT
 from pnu.geometry.even_spacing import repel, tangent_discs
 from pnu.geometry.farthest_sampling import farthest_points_large
-from pnu.geometry.noise_level import noise_level
+from pnu.geometry.noise_level import LOUDER, is_louder_in_places, local_noise, noise_level
 from pnu.geometry.point_tree import PointTree
 from pnu.geometry.spacing import spacing
 from pnu.geometry.spatial_blocks import along_curve
@@ -44,6 +44,7 @@ STILL_EVEN = 0.4  # so much where points were smoothed
 MOVED = 2.0  # smoothing moves points by so many times the noise at most, lest tips are drawn to the rest,
 MOVED_ALONG = 3.0  # where it moves them along given normals
 ROUNDS, ROUNDS_ALONG = 2, 8  # of smoothing
+ENOUGH = 4000  # points that tell noise in places from walls too thin for them
 MORE = 2  # passes of normals where there is no noise
 KEPT = 2**18  # queries whose projections are kept in one file
 BATCH = 512  # queries at once on a CPU,
@@ -88,7 +89,7 @@ class SurfaceProjection:
         cloud = self.with_refined_normals(cloud, self.network.passes, context)
         measured = cloud[:, :6]
         staying = measured[:0]
-        if context.smooth or noise_in_spacings(cloud) > FAINT:
+        if context.smooth or shows_noise(cloud):
             cloud = self.smoothed(cloud, context)
             staying = cloud[:, :6] if count > len(cloud) and is_even(cloud, STILL_EVEN) else staying
         else:
@@ -192,7 +193,7 @@ class SurfaceProjection:
         do, and points move along them alone.
         """
         anew = self.network.passes > 0
-        limit = (MOVED if anew else MOVED_ALONG) * noise_level(cloud[:, :3], cloud[:, 3:6])
+        limit = (MOVED if anew else MOVED_ALONG) * noise_there(cloud)[:, None]
         smooth = cloud
         for number in range(1, (ROUNDS if anew else ROUNDS_ALONG) + 1):
             which = f" {number}" if number > 1 else ""
@@ -340,6 +341,25 @@ def noise_in_spacings(cloud: Floats) -> float:
     return noise_level(cloud[:, :3], cloud[:, 3:6]) / spacing(cloud[:, :3])
 
 
+def noise_there(cloud: Floats) -> Floats:
+    """Noise at each point of a cloud (n, 6), (n,): that of the whole, but in places that are louder theirs."""
+    level = noise_level(cloud[:, :3], cloud[:, 3:6])
+    if not _is_louder_in_places(cloud, level):
+        return np.full(len(cloud), level)
+    there = local_noise(cloud[:, :3], cloud[:, 3:6])
+    return np.where(there > LOUDER * level, there, level)
+
+
+def shows_noise(cloud: Floats) -> bool:
+    """Whether noise stands out from curvature in a cloud (n, 6), or in places of it."""
+    level = noise_level(cloud[:, :3], cloud[:, 3:6])
+    return level > FAINT * spacing(cloud[:, :3]) or _is_louder_in_places(cloud, level)
+
+
+def _is_louder_in_places(cloud: Floats, level: float) -> bool:
+    return len(cloud) >= ENOUGH and is_louder_in_places(cloud[:, :3], cloud[:, 3:6], level)
+
+
 def is_even(cloud: Floats, limit: float = EVEN) -> bool:
     """Whether the points of a cloud (n, 6) are evenly spread, as farthest points are: their spacing varies by less."""
     apart = PointTree(cloud[:, :3]).among_themselves(2, threads=threads.thread_count())[0][:, 0]
@@ -370,8 +390,8 @@ def seeds_around(cloud: Floats, each: int, count: int, step: Step = silent, *, f
     return seeds
 
 
-def no_farther(limit: float, points: Floats, moved: Floats) -> Floats:
-    """Points (n, 3) on their way to where they are moved (n, 3), each there or as far as the limit."""
+def no_farther(limit: float | Floats, points: Floats, moved: Floats) -> Floats:
+    """Points (n, 3) on their way to where they are moved (n, 3), each there or as far as its limit, (n, 1) or one."""
     step = moved - points
     share = np.minimum(1, limit / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-300))
     found: Floats = points + share * step

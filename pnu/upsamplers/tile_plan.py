@@ -31,7 +31,6 @@ from pnu.geometry.cloud_normals import (
     settled_normals,
     sight_from_within,
 )
-from pnu.geometry.cloud_statistics import FAINT
 from pnu.geometry.depth_steps import depth_steps, smoothed_within_steps
 from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.normal_estimation import complete_normals
@@ -46,7 +45,7 @@ from pnu.io.scan_columns import scan_numbers
 from pnu.io.sensor import Sight, asked_sight, sight_of
 from pnu.runtime.progress import Progress, silent
 from pnu.upsamplers.poor_axes import poor_axes
-from pnu.upsamplers.surface_projection import is_even, noise_in_spacings
+from pnu.upsamplers.surface_projection import is_even, shows_noise
 
 SAMPLE = 2**18  # points that say where tiles are cut,
 COARSE = 50_000  # and of the coarse cloud that says to which side normals look
@@ -453,7 +452,7 @@ def _look(points: np.ndarray, normals: np.ndarray | None, keys: Keys, size: int)
     known = settled_normals(points, None).normals if known is None else known
     scale = np.abs(points - points.mean(0)).max()
     cloud = np.hstack([(points - points.mean(0)) / scale, known])
-    look["noisy"] = noise_in_spacings(cloud) > FAINT
+    look["noisy"] = shows_noise(cloud)
     look["loud"] = is_noisy(points, known)
     look["even"] = thinned is None and is_even(cloud) and not look["noisy"]
     return look
