@@ -76,6 +76,7 @@ def test_clouds_of_each_kind(kind: str) -> None:
         assert stripes[:4].sum() > 4 * stripes[8:].sum()
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "meshes").mkdir()
     write_mesh(tmp_path / "meshes" / "ball.ply", icosphere(3))

@@ -129,6 +129,7 @@ def test_a_layer_of_noise_may_stay() -> None:
         clean_cloud(Cloud(points, None, {}), noise="never")  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_layer_with_normals_keeps_their_means() -> None:
     points, true = thick_sphere(20000, 0.05)
     found = clean_cloud(Cloud(points, true, {})).cloud
@@ -300,6 +301,7 @@ def test_a_cloud_that_thins_out_keeps_its_thin_end() -> None:
     assert np.mean(lost) < 0.0006
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("in_place", "most"), [(True, 0.2), (False, 0.02)])
 @pytest.mark.parametrize("name", ["person", "impeller"])
 def test_torn_points_of_a_depth_camera_go_and_slanted_walls_stay(name: str, in_place: bool, most: float) -> None:

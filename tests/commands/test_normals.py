@@ -334,6 +334,7 @@ def test_what_cannot_be_used_is_left_out_and_said(place: Path, capsys: pytest.Ca
     np.testing.assert_array_equal(read_cloud("out.ply").attributes["number"], np.delete(np.arange(600), 7))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("told", "side"),
     [

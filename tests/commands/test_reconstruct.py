@@ -117,6 +117,7 @@ def test_open_truth_and_inward_normals_are_said(
     assert "normals look inward" in said[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("keys", [{"viewpoint": "0,0,0"}, {"side": "in"}])
 def test_what_was_seen_from_within_looks_inward(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], keys: dict[str, str]

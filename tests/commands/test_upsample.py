@@ -249,6 +249,7 @@ def test_what_was_left_out_while_reading_is_said(place: Path) -> None:
     assert len(read_cloud(place / "dense.ply").points) == 360
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run", ["surface", "pnu_residual"])
 def test_who_tells_the_side_gets_normals_as_good_as_who_does_not(place: Path, run: str) -> None:
     points = sample_poisson_disk(shapes.make("teddy"), 600, np.random.default_rng(0))[:, :3]

@@ -24,6 +24,7 @@ assert all(np.array_equal(a, b) for a, b in zip(plain, found))
 """
 
 
+@pytest.mark.slow
 def test_points_in_a_plane_through_the_origin() -> None:
     """In a process of its own: SciPy's own tree ends it."""
     pytest.importorskip("torch")

@@ -53,6 +53,7 @@ def test_knn_of_many_equal_distances(k: int) -> None:
     assert torch.equal(idx.cpu(), (torch.arange(3)[:, None] + 3 * torch.arange(k)).expand(2, -1, -1))
 
 
+@pytest.mark.slow
 def test_knn_of_points_that_are_not_numbers() -> None:
     """They are the farthest of all, and have no neighbors before others."""
     target = cloud(1, 70)

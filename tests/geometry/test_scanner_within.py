@@ -61,6 +61,7 @@ def test_the_same_room_sampled_evenly_is_a_box_that_looks_outward() -> None:
     assert (outward > 0).mean() > 0.98
 
 
+@pytest.mark.slow
 def test_of_several_scanners_each_is_found_where_the_scans_are_told_apart() -> None:
     points, normals, _, scans = rescanned_room()
     assert ((pnu.normals(points) * normals).sum(1) > 0).mean() < 0.1
@@ -91,6 +92,7 @@ def test_of_many_scans_some_are_looked_for_and_what_sees_a_point_decides(monkeyp
     assert ((settled.normals * normals).sum(1) > 0).mean() > 0.98
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [0, 200])
 def test_of_several_places_what_sees_a_point_decides(more: int) -> None:
     """The way of a scanner, of which it is not known where it saw what."""
@@ -107,6 +109,7 @@ def test_of_several_places_what_sees_a_point_decides(more: int) -> None:
         settled_normals(points, None, asked=Sight("on its way", places=way + [447321.0, 5411934, 313]))
 
 
+@pytest.mark.slow
 def test_sensors_that_cannot_have_seen_the_points_are_not_believed() -> None:
     """As files name them that put all scans at one place, or the origin of a map for a scanner."""
     points, normals, true, scans = rescanned_room()
@@ -123,6 +126,7 @@ def test_sensors_that_cannot_have_seen_the_points_are_not_believed() -> None:
         assert ("can't be" in settled.words) == doubt
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ["mug", "teddy", "nut"])
 def test_none_is_found_in_what_was_scanned_from_outside(name: str, kind: str) -> None:
@@ -139,6 +143,7 @@ def test_a_star_made_along_rays_from_its_middle_looks_outward() -> None:
     assert ((pnu.normals(points) * points).sum(1) > 0).mean() > 0.99
 
 
+@pytest.mark.slow
 def test_of_flat_ground_alone_the_scanner_may_be_above_or_below() -> None:
     ways = sphere_directions(8000)
     ways = ways[(ways[:, 2] < -0.1) & (ways[:, 2] > -0.9)]
@@ -153,6 +158,7 @@ def test_few_points_and_equal_ones_tell_nothing() -> None:
     assert scanner_within(np.zeros((2000, 3)), np.tile([0.0, 0.0, 1.0], (2000, 1))) is None
 
 
+@pytest.mark.slow
 def test_ground_and_what_stands_on_it_look_up_and_out() -> None:
     points, normals = yard()
     settled = settled_normals(points, None)

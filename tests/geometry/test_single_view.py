@@ -117,6 +117,7 @@ def room_from_a_camera(across: int = 60) -> tuple[Array, Array]:
     return points, np.where(hit[:, None], (points - center) / radius, normals)
 
 
+@pytest.mark.slow
 def test_the_pixels_of_a_camera_at_the_origin_look_to_it() -> None:
     points, true = room_from_a_camera()
     assert is_camera(np.zeros(3), points)
@@ -130,6 +131,7 @@ def test_the_pixels_of_a_camera_at_the_origin_look_to_it() -> None:
         assert not is_camera(np.zeros(3), other)
 
 
+@pytest.mark.slow
 def test_land_looks_up() -> None:
     rng = np.random.default_rng(1)
     x, y = rng.uniform(0, 100, (2, 3000))
@@ -189,12 +191,14 @@ def test_a_camera_is_not_found_where_there_was_none() -> None:
     assert {name: camera_place(points) for name, points in clouds.items()} == dict.fromkeys(clouds)
 
 
+@pytest.mark.slow
 def test_normals_of_a_flat_thing_look_to_the_camera_that_saw_it() -> None:
     scan = KINDS["oneview"](Scanner(shapes.make("washer")), np.random.default_rng(4))
     points, true = scan.points[~scan.stray], scan.clean[~scan.stray, 3:]
     assert ((settled_normals(points, None).normals * true).sum(1) < 0).mean() < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("told", [False, True])
 def test_what_a_camera_saw_looks_to_it_even_where_it_bends_away(told: bool) -> None:
     for name, seed in (("impeller", 2), ("caltrop", 3), ("nut", 5)):

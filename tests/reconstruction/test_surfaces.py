@@ -74,6 +74,7 @@ def test_exact_points_give_the_exact_volume(cloud: np.ndarray, volume: float, to
     assert surface.warnings() == []
 
 
+@pytest.mark.slow
 def test_inward_normals_are_noticed_in_any_frame_and_the_surface_turned() -> None:
     cloud = sphere_points(1500)
     away = np.array([5e5, 4e6, -30])
@@ -84,6 +85,7 @@ def test_inward_normals_are_noticed_in_any_frame_and_the_surface_turned() -> Non
     np.testing.assert_allclose(surface.mesh.vertices.mean(0), away, atol=3)
 
 
+@pytest.mark.slow
 def test_a_room_that_was_seen_from_within_stays_as_it_was_seen() -> None:
     cloud = sphere_points(1500)
     surface = reconstruction.reconstruct(cloud[:, :3], -cloud[:, 3:], outward=False)
@@ -99,6 +101,7 @@ def test_contradicting_normals_are_noticed() -> None:
     assert any("contradict the surface" in text for text in surface.warnings())
 
 
+@pytest.mark.slow
 def test_trimming_removes_the_bubble_around_an_open_surface() -> None:
     cloud = sphere_points(4000)
     half = cloud[cloud[:, 2] > 0]

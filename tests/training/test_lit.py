@@ -246,6 +246,7 @@ class Table(pl.Callback):
             torch.save({**values, "elapsed": module.elapsed_s}, self.path)
 
 
+@pytest.mark.slow
 def test_two_processes_log_what_one_logs(tmp_path: Path) -> None:
     """Terms are means over processes; metrics are sums over them, also where they have not as many clouds."""
     # no fork: a child has no threads of its parent, but the locks that they held

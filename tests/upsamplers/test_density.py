@@ -34,6 +34,7 @@ def in_cap(points: np.ndarray) -> int:
     return int((points[:, 2] > 0.9).sum())
 
 
+@pytest.mark.slow
 def test_density_even_follow_and_auto() -> None:
     points = uneven_sphere()
     found = {d: in_cap(pnu.upsample(points, ratio=2, density=d, outliers="keep")) for d in ("even", "follow", "auto")}  # type: ignore[arg-type]

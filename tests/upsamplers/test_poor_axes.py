@@ -116,6 +116,7 @@ def test_neither_order_nor_place_rotation_and_size_nor_some_that_are_missing_hav
     assert poor_axes(points, np.full_like(points, np.nan)) == ""
 
 
+@pytest.mark.slow
 def test_of_poor_ones_the_sides_alone_count() -> None:
     """Bare points give as much; before, plane fits were believed, and what was made of them lay twice as far off."""
     points, normals = cloud(n=800)
@@ -142,6 +143,7 @@ def test_true_ones_are_used() -> None:
     np.testing.assert_array_equal(pnu.upsample(points, normals), pnu.upsample(points, normals, signs="keep"))
 
 
+@pytest.mark.slow
 def test_the_command_says_so_and_can_be_told_otherwise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = sample_poisson_disk(MESH, 600, np.random.default_rng(0))
     points, normals = found[:, :3], found[:, 3:]

@@ -115,6 +115,7 @@ def test_borders_have_the_spacing_of_the_inside(tmp_path: Path) -> None:
     np.testing.assert_allclose(made, 4800, rtol=0.03)  # so that few are left over
 
 
+@pytest.mark.slow
 def test_sides_agree_between_tiles(tmp_path: Path) -> None:
     dense = make(plan_of(tmp_path / "closed", 3 * ball(400), 220, ratio=1.5))  # by a coarse cloud of the whole: outward
     assert ((dense[:, :3] * dense[:, 3:]).sum(1) > 0).all()
@@ -130,6 +131,7 @@ def test_sides_agree_between_tiles(tmp_path: Path) -> None:
         assert (sign * dense[:, 5] > 0).all()
 
 
+@pytest.mark.slow
 def test_a_coarse_cloud_looks_to_the_scanner_that_the_whole_tells(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
