@@ -16,6 +16,7 @@ from pnu.geometry.cloud_normals import (
     normals_on_sides,
     settled_normals,
 )
+from pnu.geometry.clutter import clutter_points
 from pnu.geometry.depth_steps import depth_steps, smoothed_within_steps, steps_words
 from pnu.geometry.noise_level import is_louder_in_places, noise_level
 from pnu.geometry.single_view import camera_place
@@ -48,6 +49,7 @@ __all__ = [
     "is_noisy",
     "stray_points",
     "with_axes_anew",
+    "without_clutter",
     "without_depth_steps",
     "without_normals",
 ]
@@ -131,6 +133,15 @@ def without_depth_steps(cloud: Cloud, camera: NDArray[np.float64] | None, *, unl
         return cloud
     note = f"{steps_words(steps)}: each point moved by half a step at most, onto the surface through them ({unless})"
     return cloud._replace(points=smoothed_within_steps(cloud.points, steps), notes=(*cloud.notes, note))
+
+
+def without_clutter(cloud: Cloud, *, unless: str) -> Cloud:
+    """A cloud without what is strewn all around it, and a note on that, with what leaves it."""
+    strewn = clutter_points(cloud.points)
+    if not strewn.any():
+        return cloud
+    note = f"{strewn.sum()} of {len(strewn)} points left out: strewn all around ({unless})"
+    return chosen(cloud, np.flatnonzero(~strewn))._replace(notes=(*cloud.notes, note))
 
 
 def without_normals(cloud: Cloud, why: str) -> Cloud | None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pnu.cleaning.clutter import clutter_points
+from pnu.geometry.clutter import clutter_points
 from pnu.geometry.connected_parts import connected_parts
 from pnu.geometry.doubt_features import doubt_features
 from pnu.geometry.outlier_features import outlier_features

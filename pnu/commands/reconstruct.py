@@ -51,7 +51,7 @@ def reconstruct(cfg: Any) -> None:
     import numpy as np
 
     from pnu import io, reconstruction
-    from pnu.cleaning import without_depth_steps
+    from pnu.cleaning import without_clutter, without_depth_steps
     from pnu.geometry.cloud_statistics import describe_cloud
     from pnu.geometry.mesh_topology import open_edges, vertex_normals
     from pnu.geometry.single_view import camera_place
@@ -61,7 +61,9 @@ def reconstruct(cfg: Any) -> None:
     _check_options(cfg)
     cloud = io.read_cloud(cfg.input, normals=cfg.normals != "estimate", columns=cfg.columns)
     if cfg.normals != "keep":
-        cloud = without_depth_steps(cloud, camera_place(cloud.points), unless="normals=keep")
+        camera = camera_place(cloud.points)
+        cloud = without_clutter(cloud, unless="normals=keep") if camera is None else cloud
+        cloud = without_depth_steps(cloud, camera, unless="normals=keep")
     origin = "with normals" if cloud.normals is not None else "normals estimated and oriented"
     say(f"input:  {cfg.input}, {len(cloud.points)} points, {origin}")
     for note in cloud.notes:

@@ -7,6 +7,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from pnu.geometry.cloud_statistics import CONTRADICTING, contradicting
+from pnu.geometry.clutter import clutter_points
 from pnu.geometry.depth_steps import depth_steps, smoothed_within_steps, steps_words
 from pnu.geometry.flipped_parts import flipped_share
 from pnu.geometry.normal_estimation import complete_normals, orient_normals, refit_normals
@@ -121,12 +122,22 @@ def settled_through_noise(
     scans: np.ndarray | None = None,
     **options: Any,
 ) -> Settled:
-    """As `settled_normals`; but of points (n, 3) without normals those whose depths come in wide steps have the normals
+    """As `settled_normals`; but points (n, 3) without normals that are strewn all around others
+    (`pnu.geometry.clutter`) have that of the nearest of these, those whose depths come in wide steps have the normals
     of the surface through these (`pnu.geometry.depth_steps`), and each of a layer thicker than their spacing that of
     the nearest of the means that stand for them (`pnu.geometry.thick_layers`)."""
     if normals is not None and options.get("choice") != "estimate":
         return settled_normals(points, normals, asked=asked, found=found, scans=scans, **options)
     camera = camera_place(points)
+    strewn = clutter_points(points) if camera is None else np.zeros(len(points), bool)
+    if strewn.any():
+        rows = np.flatnonzero(~strewn)
+        of_rows = {"asked": _of_rows(asked, rows), "found": _of_rows(found, rows)}
+        some = None if scans is None else scans[rows]
+        settled = settled_through_noise(points[rows], None, scans=some, **of_rows, **options)
+        nearest = PointTree(points[rows]).nearest(points, 1)[1][:, 0]
+        settled = settled._replace(normals=settled.normals[nearest])
+        return _by_other_points(settled, f"without {strewn.sum()} that are strewn all around")
     steps = depth_steps(points, camera)
     if steps is not None:
         points = smoothed_within_steps(points, steps)

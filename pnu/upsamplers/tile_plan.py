@@ -463,6 +463,8 @@ def _coarse_cloud(folder: Path, keys: Keys, facts: Facts, full: list[int]) -> No
     step = max(1, facts.points // (4 * COARSE))
     parts = [np.load(folder / f"points_{number:05}.npy", mmap_mode="r")[::step] for number in full]
     rows = np.concatenate([np.asarray(part) for part in parts])
+    if keys.outliers == "auto":  # farthest points would be stray ones first
+        rows = rows[~stray_points(rows["point"])]
     asked, found = asked_sight(keys.viewpoint, keys.up, keys.side), None
     if len(rows) > COARSE:
         kept = farthest_points_large(rows["point"], COARSE)

@@ -303,3 +303,18 @@ def test_exactly_so_many() -> None:
     more = exactly(line, 0, 10)
     assert len(np.unique(more[:, 0])) == 10
     np.testing.assert_array_equal(more[:8], line)
+
+
+@pytest.mark.slow
+def test_what_is_strewn_all_around_goes_and_does_not_turn_the_rest(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    sphere = rng.standard_normal((24000, 3))
+    sphere *= 10 / np.linalg.norm(sphere, axis=1, keepdims=True)
+    points = np.vstack([sphere, rng.uniform(-12, 12, (8000, 3))])
+    plan = plan_of(tmp_path, points, 20000, ratio=1)
+    assert len(plan.tiles) > 1
+    dense = make(plan)
+    assert len(dense) == len(points)
+    radius = np.linalg.norm(dense[:, :3], axis=1)
+    assert np.abs(radius - 10).max() < 1
+    assert ((dense[:, :3] * dense[:, 3:]).sum(1) > 0.9 * radius).mean() > 0.999

@@ -1,16 +1,19 @@
 """Clutter: what is strewn all around a surface goes, however much it is, and sparse places and trees stay."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 import pnu
-from pnu.cleaning.clutter import FEWEST, clutter_points
 from pnu.cleaning.outliers import stray_points
+from pnu.commands.reconstruct import main as reconstruct_command
 from pnu.data import shapes
+from pnu.geometry.clutter import FEWEST, clutter_points
 from pnu.geometry.mesh_sampling import sample_area
+from pnu.io import read_mesh
 
 FAR = 0.06  # from a unit sphere of 4000 points: about two of their distances
 
@@ -51,6 +54,20 @@ def test_the_dense_cloud_lies_on_the_surface() -> None:
     assert dense.shape == (18000, 6)
     assert off(dense[:, :3]).max() < 0.1
     assert off(dense[:, :3]).mean() < 0.003
+
+
+def test_normals_are_found_without_it() -> None:
+    points = np.vstack([sphere(3000), strewn("box", 1000)])
+    normals = pnu.normals(points)
+    assert normals.shape == points.shape
+    assert (normals[:3000] * points[:3000]).sum(1).mean() > 0.999
+
+
+def test_the_surface_of_a_cloud_is_that_without_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.savetxt(tmp_path / "cloud.xyz", np.vstack([sphere(3000), strewn("box", 1000)]))
+    reconstruct_command([f"input={tmp_path}/cloud.xyz", f"output={tmp_path}/mesh.ply"])
+    assert "of 4000 points left out: strewn all around (normals=keep)" in capsys.readouterr().out
+    assert off(read_mesh(tmp_path / "mesh.ply").vertices).max() < 0.1
 
 
 def thinning_out(points: np.ndarray, most: float) -> np.ndarray:
