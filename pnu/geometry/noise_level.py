@@ -24,7 +24,7 @@ SOME = 300  # places that are looked at,
 LOUDEST = 0.9  # quantile of them,
 IN_PLACES = 0.22  # whose noise in spacings counts from there on: unresolved thin walls stay below,
 LOUDER = 3.0  # and times the noise of the whole, as medians around points of even noise vary up to 2.5 times
-ROWS = 2**14  # points at once: bounds the memory
+ROWS = 2**13  # points at once: bounds the memory
 Floats = NDArray[np.float64]
 
 
@@ -66,18 +66,16 @@ def local_noise(points: Floats, normals: Floats, rows: NDArray[np.int64] | None 
     shape there, as it would farther away (to the two normals' mean, points of a sphere are level). Their median around
     each point. A lower bound where normals follow the noise; 0 where no such points are, as in an evenly spread cloud.
     """
-    tree, around = PointTree(points), min(AROUND, len(points))
-    rows = np.arange(len(points)) if rows is None else rows
-    named, there = np.unique(tree.nearest(points[rows], around, threads=thread_count())[1], return_inverse=True)
-    height = np.empty(len(named))
-    for first in range(0, len(named), ROWS):
-        some = named[first : first + ROWS]
-        distance, near = tree.nearest(points[some], min(CLOSEST, len(points)), threads=thread_count())
-        height[first : first + ROWS] = _over_another(points, normals, some, near[:, 1:], distance[:, 1:6].mean(1))
-    level: Floats = np.zeros(len(rows))
-    heights = height[there.reshape(-1, around)]
-    told = np.isfinite(heights).any(1)
-    level[told] = MEDIAN * np.nanmedian(heights[told], axis=1)
+    tree, rows = PointTree(points), np.arange(len(points)) if rows is None else rows
+    level, height, known = np.zeros(len(rows)), np.empty(len(points)), np.zeros(len(points), bool)
+    for first in range(0, len(rows), ROWS):
+        part = slice(first, first + ROWS)
+        around = tree.nearest(points[rows[part]], min(AROUND, len(points)), threads=thread_count())[1]
+        new = np.unique(around[~known[around]])
+        height[new], known[new] = _over_others(points, normals, new, tree), True
+        heights = height[around]
+        told = np.isfinite(heights).any(1)
+        level[part][told] = MEDIAN * np.nanmedian(heights[told], axis=1)
     return level
 
 
@@ -89,19 +87,23 @@ def is_louder_in_places(points: Floats, normals: Floats, level: float) -> bool:
     return bool(np.quantile(there, LOUDEST) > max(IN_PLACES * spacing(points), LOUDER * level))
 
 
-def _over_another(
-    points: Floats, normals: Floats, rows: NDArray[np.int64], near: NDArray[np.int64], apart: Floats
-) -> Floats:
-    """How far rows (m,) of points (n, 3) lie over that of their neighbors (m, k) that is most nearly below or above,
-    (m,); NaN where none is within a share of how far they lie apart, (m,)."""
-    offset, axis = points[near] - points[rows, None], normals[near] + normals[rows, None]
-    alike = (normals[near] * normals[rows, None]).sum(2) > ALIKE
-    axis /= np.maximum(np.linalg.norm(axis, axis=2, keepdims=True), 1e-9)
-    height = (offset * axis).sum(2)
-    beside = np.where(alike, np.linalg.norm(offset - height[:, :, None] * axis, axis=2), np.inf)
-    nearest = beside.argmin(1)[:, None]
-    height, beside = (np.take_along_axis(values, nearest, 1)[:, 0] for values in (height, beside))
-    return np.where(beside < NEAR * apart, np.abs(height), np.nan)
+def _over_others(points: Floats, normals: Floats, rows: NDArray[np.int64], tree: PointTree) -> Floats:
+    """How far rows (m,) of points (n, 3) lie over that of their neighbors that is most nearly below or above, (m,); NaN
+    where none is within a share of their distances."""
+    found = np.empty(len(rows))
+    for first in range(0, len(rows), ROWS):
+        some = rows[first : first + ROWS]
+        distance, near = tree.nearest(points[some], min(CLOSEST, len(points)), threads=thread_count())
+        near, apart = near[:, 1:], distance[:, 1:6].mean(1)
+        offset, axis = points[near] - points[some, None], normals[near] + normals[some, None]
+        alike = (normals[near] * normals[some, None]).sum(2) > ALIKE
+        axis /= np.maximum(np.linalg.norm(axis, axis=2, keepdims=True), 1e-9)
+        height = (offset * axis).sum(2)
+        beside = np.where(alike, np.linalg.norm(offset - height[:, :, None] * axis, axis=2), np.inf)
+        nearest = beside.argmin(1)[:, None]
+        height, beside = (np.take_along_axis(values, nearest, 1)[:, 0] for values in (height, beside))
+        found[first : first + ROWS] = np.where(beside < NEAR * apart, np.abs(height), np.nan)
+    return found
 
 
 def _residuals(near: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
