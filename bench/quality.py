@@ -38,7 +38,7 @@ class Setting(NamedTuple):
     planes: int = 0  # or with those of planes fitted to so many neighbors, on the right side, as files often have them
     points: int | None = None
     noise: float = 0.0
-    most: float = 0.0  # noise that grows with the square of x, from none at the one end to this at the other
+    ramp: float = 0.0  # noise that grows with the square of x, from none at the one end to this at the other
     ratio: float = 4
 
 
@@ -48,8 +48,8 @@ SETTINGS = {
     "noise_0.5": Setting("points only, noise 0.5 %", noise=0.005),
     "noise_1": Setting("points only, noise 1 %", noise=0.01),
     "given_noise_0.5": Setting("normals given, noise 0.5 %", given=True, noise=0.005),
-    "noise_0_2": Setting("points only, noise from 0 to 2 %", most=0.02),
-    "given_noise_0_2": Setting("normals given, noise from 0 to 2 %", given=True, most=0.02),
+    "noise_0_2": Setting("points only, noise from 0 to 2 %", ramp=0.02),
+    "given_noise_0_2": Setting("normals given, noise from 0 to 2 %", given=True, ramp=0.02),
     "planes": Setting("plane fits given as normals", planes=16),
     "planes_noise_0.5": Setting("plane fits given as normals, noise 0.5 %", planes=16, noise=0.005),
     "planes_2048": Setting("plane fits given as normals, 2048 points", planes=16, points=2048),
@@ -82,9 +82,9 @@ def inputs(cases: Iterator[Case], setting: Setting, seed: int) -> Iterator[Case]
             points, normals = points[kept], normals[kept] if normals is not None else None
         if setting.noise:
             points = points + setting.noise * rng.standard_normal(points.shape)
-        if setting.most:
+        if setting.ramp:
             along = (points[:, :1] - points[:, 0].min()) / np.ptp(points[:, 0])
-            points = points + setting.most * along**2 * rng.standard_normal(points.shape)
+            points = points + setting.ramp * along**2 * rng.standard_normal(points.shape)
         if setting.planes and normals is not None:
             planes = estimate_normals(points, setting.planes, orient=False)
             normals = np.where((planes * normals).sum(1, keepdims=True) < 0, -planes, planes)

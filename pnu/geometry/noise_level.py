@@ -20,6 +20,7 @@ NEAR = 0.5  # spacings beside it at most,
 ALIKE = 0.5  # and cosine of the angle between normals at least,
 AROUND = 33  # by each and its neighbors
 MEDIAN = 1.4826 / 2**0.5  # standard deviation over the median distance of two
+ENOUGH = 4000  # points that tell noise in places from walls too thin for them
 SOME = 300  # places that are looked at,
 LOUDEST = 0.9  # quantile of them,
 IN_PLACES = 0.22  # whose noise in spacings counts from there on: unresolved thin walls stay below,
@@ -81,7 +82,9 @@ def local_noise(points: Floats, normals: Floats, rows: NDArray[np.int64] | None 
 
 def is_louder_in_places(points: Floats, normals: Floats, level: float) -> bool:
     """Whether at one of ten points (n, 3) with unit normals (n, 3) there is much noise (`local_noise`) beside their
-    spacing, and beside that of the whole, `level`."""
+    spacing, and beside that of the whole, `level`. Never of fewer than 4000 points."""
+    if len(points) < ENOUGH:
+        return False
     some = np.unique(np.linspace(0, len(points) - 1, SOME).round().astype(np.int64))
     there = local_noise(points, normals, np.lexsort(points.T)[some])
     return bool(np.quantile(there, LOUDEST) > max(IN_PLACES * spacing(points), LOUDER * level))

@@ -44,7 +44,6 @@ STILL_EVEN = 0.4  # so much where points were smoothed
 MOVED = 2.0  # smoothing moves points by so many times the noise at most, lest tips are drawn to the rest,
 MOVED_ALONG = 3.0  # where it moves them along given normals
 ROUNDS, ROUNDS_ALONG = 2, 8  # of smoothing
-ENOUGH = 4000  # points that tell noise in places from walls too thin for them
 MORE = 2  # passes of normals where there is no noise
 KEPT = 2**18  # queries whose projections are kept in one file
 BATCH = 512  # queries at once on a CPU,
@@ -344,7 +343,7 @@ def noise_in_spacings(cloud: Floats) -> float:
 def noise_there(cloud: Floats) -> Floats:
     """Noise at each point of a cloud (n, 6), (n,): that of the whole, but in places that are louder theirs."""
     level = noise_level(cloud[:, :3], cloud[:, 3:6])
-    if not _is_louder_in_places(cloud, level):
+    if not is_louder_in_places(cloud[:, :3], cloud[:, 3:6], level):
         return np.full(len(cloud), level)
     there = local_noise(cloud[:, :3], cloud[:, 3:6])
     return np.where(there > LOUDER * level, there, level)
@@ -353,11 +352,7 @@ def noise_there(cloud: Floats) -> Floats:
 def shows_noise(cloud: Floats) -> bool:
     """Whether noise stands out from curvature in a cloud (n, 6), or in places of it."""
     level = noise_level(cloud[:, :3], cloud[:, 3:6])
-    return level > FAINT * spacing(cloud[:, :3]) or _is_louder_in_places(cloud, level)
-
-
-def _is_louder_in_places(cloud: Floats, level: float) -> bool:
-    return len(cloud) >= ENOUGH and is_louder_in_places(cloud[:, :3], cloud[:, 3:6], level)
+    return level > FAINT * spacing(cloud[:, :3]) or is_louder_in_places(cloud[:, :3], cloud[:, 3:6], level)
 
 
 def is_even(cloud: Floats, limit: float = EVEN) -> bool:
