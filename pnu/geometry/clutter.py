@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pnu.geometry.fitted_planes import FittedPlanes
 from pnu.geometry.point_tree import PointTree
+from pnu.geometry.spatial_blocks import some_rows
 from pnu.runtime.threads import thread_count
 
 Floats = NDArray[np.float64]
@@ -37,8 +38,7 @@ def clutter_points(points: Floats) -> NDArray[np.bool_]:
     found, enough = np.zeros(len(points), bool), MANY
     if len(points) < FEWEST:
         return found
-    some = np.lexsort(points.T)[np.unique(np.linspace(0, len(points) - 1, SOME).round().astype(np.int64))]
-    if _strewn(points, some)[0].mean() < MANY:
+    if _strewn(points, some_rows(points, SOME))[0].mean() < MANY:
         return found
     for _ in range(ROUNDS):
         rows = np.flatnonzero(~found)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pnu.geometry.farthest_sampling import farthest_points_large
 from pnu.geometry.point_tree import PointTree
 from pnu.geometry.spacing import spacing
+from pnu.geometry.spatial_blocks import some_rows
 from pnu.runtime.threads import thread_count
 
 PLACES = 1000
@@ -85,8 +86,7 @@ def is_louder_in_places(points: Floats, normals: Floats, level: float) -> bool:
     spacing, and beside that of the whole, `level`. Never of fewer than 4000 points."""
     if len(points) < ENOUGH:
         return False
-    some = np.unique(np.linspace(0, len(points) - 1, SOME).round().astype(np.int64))
-    there = local_noise(points, normals, np.lexsort(points.T)[some])
+    there = local_noise(points, normals, some_rows(points, SOME))
     return bool(np.quantile(there, LOUDEST) > max(IN_PLACES * spacing(points), LOUDER * level))
 
 

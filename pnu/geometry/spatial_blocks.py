@@ -106,3 +106,10 @@ def _stable_order(code: NDArray[np.int64]) -> NDArray[np.int64]:
     some = order[rows]
     order[rows] = some[np.lexsort((some, sorted_[rows]))]
     return order
+
+
+def some_rows(points: np.ndarray, count: int) -> np.ndarray:
+    """Rows (at most `count`,) spread over points (n, 3) along z: the same points in whatever order all come."""
+    places = np.unique(np.linspace(0, len(points) - 1, count).round().astype(np.int64))
+    rows: np.ndarray = np.lexsort(points.T)[places]
+    return rows
